@@ -1,0 +1,348 @@
+"""B worlds of one task, stepped together. `BatchEnv.step` is the architecture in one function."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from hipg_bench.errors import ActionError, HipgError
+from hipg_bench.families.family import Family
+from hipg_bench.families.scene import without_visuals
+from hipg_bench.layout import TaskLayout
+from hipg_bench.mechanics import health as health_law
+from hipg_bench.sim import Sim
+from hipg_bench.spec import TaskSpec
+
+NEVER = -1.0
+"""Death time of the living."""
+
+
+def _fields(spec: TaskSpec, family: Family) -> dict[str, int]:
+    """What an episode remembers, in the order of ``userdata``."""
+    n = spec.num_agents
+    common = {
+        "health": n, "exposure": n, "toughness": n, "death_time": n, "death_cause": n,
+        "episode_id": 1, "elapsed": 1, "return": 1,
+    }  # fmt: skip
+    return {**common, **family.fields}
+
+
+def world_model(spec: TaskSpec, family: Family, *, visual: bool = False) -> mujoco.MjModel:
+    """Compile a task's world; the state rows are the same with and without what only a camera sees."""
+    scene = family.scene() if visual else without_visuals(family.scene())
+    scene.nuserdata = sum(_fields(spec, family).values())
+    return scene.compile()
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """What one control step returns. Arrays are the caller's to keep.
+
+    Attributes:
+        observation: (B, N, O) float32, of the new episode where one just ended. A dead agent's row
+            holds its own health 0 and zeros.
+        reward: (B,) team reward of the step.
+        terminated: (B,) the rules ended the episode.
+        truncated: (B,) the horizon ended it.
+        info: ``state`` (B, S) float32; ``health`` (B, N); ``alive`` (B, N) bool; ``terms`` name to (B,),
+            weighted, their sum is the reward; ``final_observation`` (B, N, O), ``final_state`` (B, S) and
+            ``final_alive`` (B, N), those of the step itself, whether or not an episode ended; ``metrics``
+            name to (B,), NaN but where an episode ended; ``end_reason`` (B,) str, empty but there;
+            ``episode_id`` (B,) and ``elapsed`` (B,) control steps of the episode that the observation is of.
+    """
+
+    observation: Float[np.ndarray, "B N O"]
+    reward: Float[np.ndarray, "B"]
+    terminated: Bool[np.ndarray, "B"]
+    truncated: Bool[np.ndarray, "B"]
+    info: dict[str, Any]
+
+
+class BatchEnv:
+    """B worlds of one task.
+
+    What happens in an episode depends on (seed, episode id) and the actions, never on B, on the
+    thread count or on which world runs it. World b starts with episode b; a world that ends goes on
+    with the next id not yet used.
+
+    Attributes:
+        spec: the task's numbers.
+        layout: what each number of an observation, action and joint state is.
+        model: the compiled MjModel.
+        decimation: physics steps per control step.
+        num_envs, num_agents, action_size, observation_size, state_size: B, N, A, O, S.
+    """
+
+    def __init__(self, spec: TaskSpec, family: Family, num_envs: int, seed: int, threads: int = 0) -> None:
+        self.spec = spec
+        self.family = family
+        self.layout: TaskLayout = family.layout
+        self.num_envs = num_envs
+        self.num_agents = spec.num_agents
+        self.action_size = family.layout.action.size
+        self.observation_size = family.layout.observation.size
+        self.state_size = family.layout.state.size
+        self.decimation = family.physics_steps
+        self.model = world_model(spec, family)
+        self._sim = Sim(
+            self.model,
+            num_envs,
+            _fields(spec, family),
+            decimation=family.physics_steps,
+            derived=family.derived,
+            threads=threads,
+        )
+        self._seed = seed
+        self._next_episode = 0
+        self._now: Any = None
+        self._closed = False
+
+    def reset(self, episode_id: Int[np.ndarray, "B"] | None = None) -> Step:
+        """Start every world anew.
+
+        Args:
+            episode_id: (B,) the episodes to run, by default 0..B-1.
+        """
+        self._check_open()
+        ids = np.arange(self.num_envs)
+        episodes = ids if episode_id is None else np.asarray(episode_id, np.int64)
+        if episodes.shape != (self.num_envs,) or episodes.min() < 0:
+            raise HipgError(
+                f"{self.spec.task}: episode_id must be {self.num_envs} numbers >= 0, got {episodes.tolist()!r}"
+            )
+        self._begin(ids, episodes)
+        self._next_episode = int(episodes.max()) + 1
+        return self._resume()
+
+    def step(self, action: Float[np.ndarray, "B N A"]) -> Step:
+        """Advance every world by one control step; worlds whose episode ends start their next one.
+
+        Args:
+            action: (B, N, A), in [-1, 1]; what lies outside is clipped (where the spec says so), and what
+                dead agents are told is ignored.
+
+        Raises:
+            ActionError: wrong shape, or a value that is not finite, naming the env and the agent.
+        """
+        action = self._checked(action)
+        sim, family, field, was = self._sim, self.family, self._sim.field, self._now
+
+        # the world moves; the dead exert no force
+        if self.spec.graded_health:
+            action = action * field["health"][:, :, None]
+        family.act(sim, action)
+        sim.disable(field["health"] == 0)
+        diverged = sim.advance()
+        now = family.read(sim)
+
+        # harm becomes death
+        harm = family.harm(was, now)
+        health, field["exposure"][:] = health_law.damage(
+            field["health"], field["exposure"], field["toughness"], harm.exposure, harm.fatal,
+            graded=self.spec.graded_health,
+        )  # fmt: skip
+        field["elapsed"] += 1
+        died = (health == 0) & (field["health"] > 0)
+        np.copyto(field["death_time"], field["elapsed"], where=died)
+        np.copyto(field["death_cause"], harm.cause, where=died)
+        field["health"][:] = health
+        now = family.remember(sim, was, dataclasses.replace(now, health=health))
+
+        # the team is paid, and told how it ended
+        terms = {name: self.spec.weights[name] * term for name, term in family.reward(was, now).items()}
+        ruled, reason = family.terminated(now)
+        terminated = ruled | diverged
+        truncated = ~terminated & (field["elapsed"][:, 0] >= self.spec.horizon)
+        terms = self._pay_floor(terms, diverged)
+        reward = np.sum(list(terms.values()), axis=0)
+        field["return"][:, 0] += reward
+        end_reason = np.select([diverged, ruled, truncated], ["physics", reason, "horizon"], "")
+
+        # what was seen, then the next episode where this one is over
+        observation, state = self._perceive(now)
+        done = terminated | truncated
+        info: dict[str, Any] = {
+            "final_observation": observation, "final_state": state, "final_alive": health > 0,
+            "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, np.flatnonzero(done)),
+        }  # fmt: skip
+        observation, state = observation.copy(), state.copy()
+        if done.any():
+            ids = np.flatnonzero(done)
+            self._begin(ids, self._next_episode + np.arange(len(ids)))
+            self._next_episode += len(ids)
+            observation[ids], state[ids] = self._perceive(family.read(sim, ids))
+            self._now = family.read(sim)
+        else:
+            self._now = now
+        return Step(observation, reward, terminated, truncated, {**info, **self._present(state)})
+
+    @property
+    def rows(self) -> Float[np.ndarray, "B R"]:
+        """A copy of all worlds: row b is everything that evolves in world b."""
+        return self._sim.rows.copy()
+
+    def load_rows(self, ids: Int[np.ndarray, "n"], rows: Float[np.ndarray, "n R"]) -> Step:
+        """Put saved worlds into places ``ids``; return what their agents see now, reward 0.
+
+        Raises:
+            HipgError: rows of another task, or ids outside 0..B-1.
+        """
+        self._check_open()
+        ids = np.atleast_1d(np.asarray(ids))
+        expected = (len(ids), self._sim.rows.shape[1])
+        if rows.shape != expected or ids.min() < 0 or ids.max() >= self.num_envs:
+            raise HipgError(
+                f"{self.spec.task}: rows of shape {expected} for ids in 0..{self.num_envs - 1} are allowed, "
+                f"got {rows.shape} for {ids.tolist()}"
+            )
+        self._sim.reset(ids)
+        self._sim.rows[ids] = rows
+        self._sim.refresh(ids)
+        self._next_episode = max(self._next_episode, int(self._sim.field["episode_id"].max()) + 1)
+        return self._resume()
+
+    def fork(self, rows: Float[np.ndarray, "n R"], health: Mapping[int, float]) -> Float[np.ndarray, "n R"]:
+        """Return copies of saved worlds in which some agents' health is set: the true counterfactual.
+
+        This is the world that eqn:min_health_baseline of the paper asks about. Health only falls.
+
+        Args:
+            rows: saved worlds.
+            health: agent to its new health, in [0, 1].
+
+        Raises:
+            HipgError: an agent outside 0..N-1, or a health outside [0, 1].
+        """
+        forked = rows.copy()
+        current = self._sim.userdata_of(forked, "health")
+        died_at = self._sim.userdata_of(forked, "death_time")
+        elapsed = self._sim.userdata_of(forked, "elapsed")[:, 0]
+        for agent, value in health.items():
+            if not (0 <= agent < self.num_agents and 0 <= value <= 1):
+                raise HipgError(
+                    f"{self.spec.task}: agents 0..{self.num_agents - 1} and health in [0, 1] are allowed, "
+                    f"got health[{agent}] = {value}"
+                )
+            if value == 0:
+                died_at[:, agent] = np.where(current[:, agent] > 0, elapsed, died_at[:, agent])
+            current[:, agent] = np.minimum(current[:, agent], value)
+        return forked
+
+    def close(self) -> None:
+        """Refuse further use."""
+        self._closed = True
+
+    def _begin(self, ids: Int[np.ndarray, "n"], episodes: Int[np.ndarray, "n"]) -> None:
+        """Start episodes in worlds ``ids``: all chance of an episode is drawn here."""
+        n, size = self.num_agents, self.num_agents + self.family.chance_size
+        # the episode takes the counter's highest word: draws advance the lowest, so streams never meet
+        chance = np.stack([
+            np.random.Generator(np.random.Philox(key=self._seed, counter=[0, 0, 0, episode])).random(size)
+            for episode in episodes.tolist()
+        ])  # fmt: skip
+        self._sim.reset(ids)
+        field = self._sim.field
+        field["health"][ids] = 1.0
+        field["toughness"][ids] = -np.log1p(-chance[:, :n])
+        field["death_time"][ids] = NEVER
+        field["episode_id"][ids, 0] = episodes
+        self.family.reset(self._sim, ids, chance[:, n:])
+        self._sim.refresh(ids)
+
+    def _resume(self) -> Step:
+        """Look at the worlds as they stand."""
+        self._now = self.family.read(self._sim)
+        observation, state = self._perceive(self._now)
+        nothing = np.zeros(self.num_envs, bool)
+        info: dict[str, Any] = {
+            "final_observation": observation.copy(), "final_state": state.copy(),
+            "final_alive": self._sim.field["health"] > 0,
+            "terms": {name: np.zeros(self.num_envs) for name in (*self.spec.weights, "physics")},
+            "end_reason": np.full(self.num_envs, ""),
+            "metrics": self._measure(self._now, np.empty(0, np.int64)),
+        }  # fmt: skip
+        info |= self._present(state)
+        return Step(observation, np.zeros(self.num_envs), nothing, nothing.copy(), info)
+
+    def _present(self, state: Float[np.ndarray, "B S"]) -> dict[str, Any]:
+        """The part of ``info`` that belongs to the episode the observation is of."""
+        field = self._sim.field
+        return {
+            "state": state,
+            "health": field["health"].copy(),
+            "alive": field["health"] > 0,
+            "episode_id": field["episode_id"][:, 0].astype(np.int64),
+            "elapsed": field["elapsed"][:, 0].astype(np.int64),
+        }
+
+    def _perceive(self, now: Any) -> tuple[Float[np.ndarray, "n N O"], Float[np.ndarray, "n S"]]:
+        """Observations, the dead blinded (property 4 of the paper), and joint states."""
+        observation, layout = self.family.observe(now), self.layout
+        dead = now.health == 0
+        if dead.any():
+            observation[dead] = 0.0
+            observation[dead, layout.observation.slices[layout.health_block]] = layout.dead_value
+        return observation, self.family.state(now)
+
+    def _measure(self, now: Any, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "B"]]:
+        """Metrics of the episodes that end in worlds ``ids``; NaN elsewhere."""
+        names = ("return", "length", "survival", "deaths", "first_death", *self.family.metrics)
+        out = {name: np.full(self.num_envs, np.nan) for name in names}
+        if len(ids):
+            field = self._sim.field
+            died_at = field["death_time"][ids]
+            dead = died_at != NEVER
+            length = field["elapsed"][ids, 0]
+            out["return"][ids] = field["return"][ids, 0]
+            out["length"][ids] = length
+            out["survival"][ids] = 1.0 - dead.mean(axis=1)
+            out["deaths"][ids] = dead.sum(axis=1)
+            # undefined (NaN) where nobody died
+            first = np.where(dead, died_at, np.inf).min(axis=1)
+            out["first_death"][ids] = np.where(np.isfinite(first), first, np.nan)
+            for name, value in self.family.measure(self._sim, ids, now).items():
+                out[name][ids] = value
+        return out
+
+    def _pay_floor(
+        self, terms: dict[str, Float[np.ndarray, "B"]], diverged: Bool[np.ndarray, "B"]
+    ) -> dict[str, Float[np.ndarray, "B"]]:
+        """Make the return of diverged episodes the task's floor, so that breaking physics never pays."""
+        if not diverged.any():
+            return {**terms, "physics": np.zeros(self.num_envs)}
+        floor = self.spec.floor - self._sim.field["return"][:, 0]
+        paid = {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
+        return {**paid, "physics": np.where(diverged, floor, 0.0)}
+
+    def _checked(self, action: Float[np.ndarray, "B N A"]) -> Float[np.ndarray, "B N A"]:
+        self._check_open()
+        if self._now is None:
+            raise HipgError(f"{self.spec.task}: step() before reset()")
+        action = np.asarray(action, np.float64)
+        expected = (self.num_envs, self.num_agents, self.action_size)
+        if action.shape != expected:
+            raise ActionError(
+                f"{self.spec.task}: actions of shape {expected} (B, N, A) are allowed, got {action.shape}"
+            )
+        alive = self._sim.field["health"][:, :, None] > 0
+        bad = alive & ~np.isfinite(action)
+        if bad.any():
+            env, agent, axis = np.argwhere(bad)[0].tolist()
+            raise ActionError(
+                f"{self.spec.task}: finite actions are allowed, got {action[env, agent, axis]} "
+                f"for env {env}, agent {agent} ({self.layout.action.blocks[0].name}[{axis}])"
+            )
+        action = np.where(alive, action, 0.0)
+        return np.clip(action, -1.0, 1.0) if self.spec.clip_actions else action
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise HipgError(f"{self.spec.task}: this environment is closed")
+
+
+__all__ = ["NEVER", "BatchEnv", "Step", "world_model"]

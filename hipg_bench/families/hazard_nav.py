@@ -1,0 +1,223 @@
+"""Hazard navigation: N drones watch N monitor points, some of which kill.
+
+Who: N drones that take off from the ground. What pays: a live drone near every point, all the time.
+What hurts: a few points lie in a hazard that looks like any other point until a drone first comes
+within its radius; from then on every drone knows it. Death grows likelier towards its centre. A
+hazardous point is still worth watching, from its edge. When it ends: at the horizon, never before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pydantic
+from jaxtyping import Bool, Float, Int
+
+from hipg_bench.families import drones
+from hipg_bench.families.family import EVERY, Harm, Rows
+from hipg_bench.families.scene import add_marker
+from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.mechanics import coverage, hazards, health
+from hipg_bench.sim import Sim
+from hipg_bench.spec import TaskSpec, parse
+
+_CANDIDATES = 8
+"""Layouts of points drawn per episode, of which the most spread one is used."""
+_TAKE_OFF = (0.1, 0.25)
+"""Height of drones at the start, m."""
+_POINT_HEIGHT = (0.4, 0.9)
+"""Height of points, as a share of the ceiling."""
+
+
+class Params(drones.DroneParams):
+    """Numbers of hazard navigation.
+
+    Attributes:
+        hazards: how many of the N points are hazardous.
+        hazard_radius: beyond it a hazard is harmless, m.
+        hazard_peak: chance of death per 0.1 s at its centre.
+        nobody: distance that is charged for a point when no drone is nearer or alive, m.
+    """
+
+    hazards: int = pydantic.Field(ge=0, le=31)
+    hazard_radius: float = pydantic.Field(gt=0, le=5)
+    hazard_peak: float = pydantic.Field(ge=0, lt=1)
+    nobody: float = pydantic.Field(gt=0, le=20)
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """The world at the end of a control step."""
+
+    position: Float[np.ndarray, "B N 3"]  # m
+    velocity: Float[np.ndarray, "B N 3"]  # m/s
+    health: Float[np.ndarray, "B N"]
+    point: Float[np.ndarray, "B P 3"]  # m
+    hazardous: Bool[np.ndarray, "B P"]
+    revealed: Bool[np.ndarray, "B P"]  # hazardous, and known to be
+    distance: Float[np.ndarray, "B P N"]  # point to drone, m
+
+
+class HazardNav:
+    """Rules of hazard navigation; see `hipg_bench.families.family.Family` for each method."""
+
+    causes = ("hazard",)
+    metrics = ("covered", "collisions", "revealed")
+    derived = False
+
+    def __init__(self, spec: TaskSpec) -> None:
+        self.spec = spec
+        self.params = params = parse(Params, spec.params, spec.task)
+        n = points = spec.num_agents
+        self.physics_steps = drones.physics_steps(spec)
+        self.fields = {"hazardous": points, "revealed": points, "collisions": 1, "covered": 1}
+        self.chance_size = _CANDIDATES * points * 3 + n * 3
+        self._slots = min(n - 1, params.neighbors)
+        within = f"within {params.sensing_radius:g} m"
+        self.layout = TaskLayout(
+            observation=Layout((
+                Block("health", (1,), "1"),
+                Block("velocity", (3,), "m/s", "world"),
+                Block("position", (3,), "m", "world"),
+                Block("point_position", (points, 3), "m", "own", "always, nearest point first"),
+                Block("point_hazardous", (points,), "1", "-", "once any drone came within its radius"),
+                Block("point_gap", (points,), "m", "-", f"distance to the nearest other live drone {within}, else that radius"),
+                *drones.neighbor_blocks(self._slots, within),
+            )),
+            action=drones.ACTION,
+            state=Layout((
+                Block("health", (n,), "1"),
+                Block("position", (n, 3), "m", "world"),
+                Block("velocity", (n, 3), "m/s", "world"),
+                Block("point_position", (points, 3), "m", "world"),
+                Block("point_hazardous", (points,), "1"),
+                Block("point_revealed", (points,), "1"),
+            )),
+        )  # fmt: skip
+
+    def scene(self) -> mujoco.MjSpec:
+        """N drones and N points; the points are mocap bodies, so that they are part of the row."""
+        scene = drones.drone_scene(self.spec, self.params)
+        for i in range(self.spec.num_agents):
+            add_marker(scene, f"point{i}", "point.xml")
+        return scene
+
+    def reset(self, sim: Sim, ids: Int[np.ndarray, "n"], chance: Float[np.ndarray, "n K"]) -> None:
+        """Spread the points over the box, the first few of them hazardous; drones start near the ground."""
+        n, half = self.spec.num_agents, self.params.half_width
+        cut = _CANDIDATES * n * 3
+        ceiling = self.params.ceiling
+        low, high = (-half, -half, _POINT_HEIGHT[0] * ceiling), (half, half, _POINT_HEIGHT[1] * ceiling)
+        sim.marker[ids] = drones.spread(chance[:, :cut].reshape(-1, _CANDIDATES, n, 3), low, high)
+        # points are exchangeable, and agents never see their order: the first ones may be the hazards
+        sim.field["hazardous"][ids] = np.arange(n) < self.params.hazards
+        start = chance[:, cut:].reshape(-1, n, 3)
+        low, high = np.array([-half, -half, _TAKE_OFF[0]]), np.array([half, half, _TAKE_OFF[1]])
+        drones.place(sim, ids, low + start * (high - low))
+
+    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
+        """Thrust along the world's axes."""
+        sim.control[:] = action.reshape(len(action), -1)
+
+    def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
+        """Positions do not lag behind the physics: they are generalised coordinates."""
+        position, velocity = drones.kinematics(sim, self.spec.num_agents, rows)
+        point = sim.marker[rows].copy()
+        return Snapshot(
+            position=position,
+            velocity=velocity,
+            health=sim.field["health"][rows].copy(),
+            point=point,
+            hazardous=sim.field["hazardous"][rows] > 0,
+            revealed=sim.field["revealed"][rows] > 0,
+            distance=coverage.distances(point, position),
+        )
+
+    def harm(self, was: Snapshot, now: Snapshot) -> Harm:
+        """Exposure from every hazard within reach."""
+        risk = hazards.risk(now.distance, self.params.hazard_radius, self.params.hazard_peak)
+        risk = np.where(now.hazardous[:, :, None], risk, 0.0)
+        exposure = health.hazard_rate(risk, self.spec.control_step / 0.1).sum(axis=1)
+        nobody = np.zeros_like(now.health, dtype=bool)
+        return Harm(exposure, fatal=nobody, cause=nobody.astype(np.int64))
+
+    def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
+        """A hazard is revealed for good once a drone that was alive came within its radius."""
+        near = ((now.distance < self.params.hazard_radius) & (was.health > 0)[:, None, :]).any(axis=2)
+        revealed = was.revealed | (now.hazardous & near)
+        sim.field["revealed"][:] = revealed
+        sim.field["collisions"][:, 0] += self._collisions(now)
+        sim.field["covered"][:, 0] += self._gap(now).mean(axis=1)
+        return dataclasses.replace(now, revealed=revealed)
+
+    def reward(self, was: Snapshot, now: Snapshot) -> dict[str, Float[np.ndarray, "B"]]:
+        """``distance``: mean over points to the nearest live drone, m; ``collision``: pairs that touch."""
+        return {"distance": self._gap(now).mean(axis=1), "collision": self._collisions(now)}
+
+    def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], str]:
+        """Never: dying must not save a team from being charged."""
+        return np.zeros(len(now.health), bool), ""
+
+    def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
+        """Own motion exactly, all points, and the nearest drones within the sensing radius."""
+        alive = now.health > 0
+        gap = now.point[:, None] - now.position[:, :, None]  # (n, N, P, 3)
+        order = np.argsort(now.distance.transpose(0, 2, 1), axis=-1, stable=True)
+        taken = self._taken(now, alive)
+        known = np.broadcast_to(now.revealed[:, None, :], order.shape)
+        return self.layout.observation.pack(
+            {
+                "health": now.health[..., None],
+                "velocity": now.velocity,
+                "position": now.position,
+                "point_position": np.take_along_axis(gap, order[..., None], axis=2),
+                "point_hazardous": np.take_along_axis(known, order, axis=2),
+                "point_gap": np.take_along_axis(taken, order, axis=2),
+                **drones.neighbors(
+                    now.position, now.velocity, now.health, self.params.sensing_radius, self._slots
+                ),
+            },
+            now.health.shape,
+        )
+
+    def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
+        """Everything, the hidden hazards included."""
+        return self.layout.state.pack(
+            {
+                "health": now.health,
+                "position": now.position,
+                "velocity": now.velocity,
+                "point_position": now.point,
+                "point_hazardous": now.hazardous,
+                "point_revealed": now.revealed,
+            },
+            now.health.shape[:1],
+        )
+
+    def measure(
+        self, sim: Sim, ids: Int[np.ndarray, "n"], now: Snapshot
+    ) -> dict[str, Float[np.ndarray, "n"]]:
+        """``covered``: mean distance from a point to its nearest live drone over the episode, m."""
+        return {
+            "covered": sim.field["covered"][ids, 0] / sim.field["elapsed"][ids, 0],
+            "collisions": sim.field["collisions"][ids, 0],
+            "revealed": sim.field["revealed"][ids].sum(axis=1),
+        }
+
+    def _gap(self, now: Snapshot) -> Float[np.ndarray, "B P"]:
+        return coverage.nearest(now.distance, now.health > 0, self.params.nobody)
+
+    def _collisions(self, now: Snapshot) -> Float[np.ndarray, "B"]:
+        """Touching pairs of live drones."""
+        apart = coverage.distances(now.position, now.position)
+        return coverage.contacts(apart, now.health > 0, 2 * self.params.drone_radius).sum(axis=(1, 2)) / 2
+
+    def _taken(self, now: Snapshot, alive: Bool[np.ndarray, "n N"]) -> Float[np.ndarray, "n N P"]:
+        """Distance from each point to the nearest other live drone that drone i senses, capped at the radius."""
+        radius = self.params.sensing_radius
+        apart = coverage.distances(now.position, now.position)
+        sensed = (apart <= radius) & alive[:, None, :] & ~np.eye(alive.shape[1], dtype=bool)
+        reach = np.where(sensed[:, :, None, :], now.distance[:, None], radius)  # (n, N, P, N)
+        return np.minimum(reach.min(axis=-1), radius)

@@ -1,0 +1,108 @@
+"""Named blocks of the flat vectors that agents and critics see.
+
+A layout is the only description of an observation: the code packs by it, the tables of
+``hipg-bench tasks show`` are printed from it, and learners find the health columns through it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """One named quantity of a flat vector.
+
+    Attributes:
+        name: what it is, e.g. ``neighbor_position``.
+        shape: its axes within one vector, e.g. ``(7, 3)`` for seven neighbours.
+        unit: ``m``, ``m/s``, ``rad``, ``1`` for pure numbers.
+        frame: ``world``, ``own`` (relative to the observer), ``body``, or ``-``.
+        visible: when the entries hold something; at other times they are 0.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    unit: str
+    frame: str = "-"
+    visible: str = "always"
+
+    @property
+    def size(self) -> int:
+        """Numbers this block takes."""
+        return math.prod(self.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """The blocks of one flat vector, in order."""
+
+    blocks: tuple[Block, ...]
+
+    @functools.cached_property
+    def size(self) -> int:
+        """Length of the flat vector."""
+        return sum(block.size for block in self.blocks)
+
+    @functools.cached_property
+    def slices(self) -> Mapping[str, slice]:
+        """Block name to its columns."""
+        ends = np.cumsum([block.size for block in self.blocks]).tolist()
+        return {
+            block.name: slice(end - block.size, end) for block, end in zip(self.blocks, ends, strict=True)
+        }
+
+    def pack(self, parts: Mapping[str, np.ndarray], lead: tuple[int, ...]) -> Float[np.ndarray, "*lead size"]:
+        """Write named arrays into a new float32 array.
+
+        Args:
+            parts: one array per block, of shape ``(*lead, *block.shape)`` or broadcastable to it.
+            lead: leading axes, ``(B, N)`` for observations and ``(B,)`` for joint states.
+
+        Raises:
+            ValueError: the names are not exactly those of the blocks.
+        """
+        if parts.keys() != self.slices.keys():
+            raise ValueError(f"parts {sorted(parts)} do not match the blocks {sorted(self.slices)}")
+        out = np.empty((*lead, self.size), np.float32)
+        for block in self.blocks:
+            target = out[..., self.slices[block.name]]
+            # splitting the last axis keeps a view, so the assignment writes through
+            target.reshape(*lead, *block.shape, copy=False)[...] = parts[block.name]
+        return out
+
+    def view(self, flat: np.ndarray, name: str) -> np.ndarray:
+        """Return one block of ``flat`` (..., size) with its own axes, as a view where NumPy can."""
+        block = next(block for block in self.blocks if block.name == name)
+        return flat[..., self.slices[name]].reshape(*flat.shape[:-1], *block.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskLayout:
+    """What a task's agents see and do, and what a central critic sees.
+
+    Attributes:
+        observation: one agent's observation, O numbers.
+        action: one agent's action, A numbers.
+        state: the joint state, S numbers.
+        health_block: the state block with one entry per agent that says whether it lives.
+        dead_value: what that entry holds at health 0 (1 where the block flags the terminated).
+    """
+
+    observation: Layout
+    action: Layout
+    state: Layout
+    health_block: str = "health"
+    dead_value: float = 0.0
+
+    @functools.cached_property
+    def health_columns(self) -> np.ndarray:
+        """(N,) columns of the joint state that a counterfactual critic input overwrites."""
+        columns = self.state.slices[self.health_block]
+        return np.arange(columns.start, columns.stop)

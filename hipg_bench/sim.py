@@ -1,0 +1,131 @@
+"""The only module that steps MuJoCo.
+
+One row of MuJoCo's integration state is one world: health, toughness and whatever else an episode
+remembers live in ``userdata``. Copying a row is snapshot, restore, fork, replay and render.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from mujoco.batch import Batch
+
+_BAD_PHYSICS = [
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+]
+
+
+class Sim:
+    """B worlds of one model.
+
+    Attributes:
+        model: the compiled model; ``nuserdata`` is the sum of ``fields``.
+        control: (B, nu) live view of the actuators' inputs.
+        position, velocity: (B, nq), (B, nv) live views of the generalised state.
+        applied: (B, nv) live view of generalised forces that mechanics add.
+        marker: (B, nmocap, 3) live view of the places of points, terminals and hazards, m.
+        field: name to (B, size) live view of what an episode remembers.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        fields: Mapping[str, int],
+        *,
+        decimation: int,
+        derived: bool,
+        threads: int = 0,
+    ) -> None:
+        """Allocate the worlds.
+
+        Args:
+            model: with agent i's actuators in group i.
+            num_envs: B.
+            fields: name to numbers kept per world in ``userdata``.
+            decimation: physics steps per control step.
+            derived: whether fields that MuJoCo derives (contacts, body frames) are read; they are
+                then current after every call, at the price of one MjData per world.
+            threads: 0 for all cores.
+        """
+        # a diverged world must keep its row: the environment ends its episode, MuJoCo must not reset it
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        self.model = model
+        self.batch = Batch(model, num_envs, threads, persistent=derived)
+        self._stage = int(mujoco.mjtStage.mjSTAGE_VEL if derived else mujoco.mjtStage.mjSTAGE_NONE)
+        self._decimation = decimation
+        self.control = self.batch.bind("ctrl")
+        self.position = self.batch.bind("qpos")
+        self.velocity = self.batch.bind("qvel")
+        self.applied = self.batch.bind("qfrc_applied")
+        self.marker = self.batch.bind("mocap_pos")
+        self.marker_orientation = self.batch.bind("mocap_quat")
+        userdata = self.batch.bind("userdata")
+        ends = np.cumsum(list(fields.values())).tolist()
+        self._columns = {
+            name: slice(end - size, end) for (name, size), end in zip(fields.items(), ends, strict=True)
+        }
+        self.field: dict[str, Float[np.ndarray, "B size"]] = {
+            name: userdata[:, columns] for name, columns in self._columns.items()
+        }
+        # a state row holds its components in the order of their bits
+        kind = mujoco.mjtState
+        before = int(kind.mjSTATE_INTEGRATION) & (int(kind.mjSTATE_USERDATA) - 1)
+        self._userdata_start = mujoco.mj_stateSize(model, before)
+        self._disabled = self.batch.expand("opt.disableactuator")
+
+    @property
+    def num_envs(self) -> int:
+        """B."""
+        return self.batch.nsim
+
+    def derived(self, name: str) -> np.ndarray:
+        """Live read-only (B, ...) view of a field MuJoCo derives, e.g. ``xpos`` or ``sensordata``."""
+        return self.batch.bind(name)
+
+    def disable(self, dead: Bool[np.ndarray, "B N"]) -> None:
+        """Cut every actuator of dead agents: their groups exert no force, whatever they are told."""
+        self._disabled[:] = dead @ (1 << np.arange(dead.shape[1]))
+
+    def advance(self) -> Bool[np.ndarray, "B"]:
+        """Run one control step on all threads.
+
+        Returns:
+            (B,) the worlds whose physics diverged in it; they are put back to the model's default
+            pose, so that everything read from them is finite, and must be reset.
+        """
+        self.batch.step(nstep=self._decimation, stage=self._stage)
+        diverged = self.batch.warning[:, _BAD_PHYSICS, 1].any(axis=1)
+        if diverged.any():
+            self.position[diverged] = self.model.qpos0
+            self.velocity[diverged] = 0.0
+            self.batch.bind("qacc_warmstart")[diverged] = 0.0
+            self.batch.forward(np.flatnonzero(diverged), self._stage)
+        return diverged
+
+    def reset(self, ids: Int[np.ndarray, "n"]) -> None:
+        """Return worlds to the model's defaults, all agents enabled; userdata becomes 0."""
+        self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self._disabled[ids] = 0
+
+    def refresh(self, ids: Int[np.ndarray, "n"]) -> None:
+        """Make derived fields current after state was written by hand."""
+        if self._stage:
+            self.batch.forward(ids, self._stage)
+
+    @property
+    def rows(self) -> Float[np.ndarray, "B R"]:
+        """Live view of all worlds."""
+        return self.batch.state
+
+    def userdata_of(self, rows: Float[np.ndarray, "n R"], name: str) -> Float[np.ndarray, "n size"]:
+        """View of one remembered field in saved rows."""
+        return rows[:, self._userdata_start :][:, self._columns[name]]
