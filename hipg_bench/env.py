@@ -113,7 +113,7 @@ class BatchEnv:
         episodes = ids if episode_id is None else np.asarray(episode_id, np.int64)
         if episodes.shape != (self.num_envs,) or episodes.min() < 0:
             raise HipgError(
-                f"{self.spec.task}: episode_id must be {self.num_envs} numbers >= 0, got {episodes.tolist()!r}"
+                f"{self.spec.task}: episode_id must be {self.num_envs} numbers >= 0, got {episodes.tolist()}"
             )
         self._begin(ids, episodes)
         self._next_episode = int(episodes.max()) + 1

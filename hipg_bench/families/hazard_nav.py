@@ -9,6 +9,7 @@ hazardous point is still worth watching, from its edge. When it ends: at the hor
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -63,16 +64,21 @@ class Snapshot:
 class HazardNav:
     """Rules of hazard navigation; see `hipg_bench.families.family.Family` for each method."""
 
-    causes = ("hazard",)
-    metrics = ("covered", "collisions", "revealed")
-    derived = False
+    causes: tuple[str, ...] = ("hazard",)
+    metrics: tuple[str, ...] = ("covered", "collisions", "revealed")
+    derived: bool = False
 
     def __init__(self, spec: TaskSpec) -> None:
         self.spec = spec
         self.params = params = parse(Params, spec.params, spec.task)
         n = points = spec.num_agents
         self.physics_steps = drones.physics_steps(spec)
-        self.fields = {"hazardous": points, "revealed": points, "collisions": 1, "covered": 1}
+        self.fields: Mapping[str, int] = {
+            "hazardous": points,
+            "revealed": points,
+            "collisions": 1,
+            "covered": 1,
+        }
         self.chance_size = _CANDIDATES * points * 3 + n * 3
         self._slots = min(n - 1, params.neighbors)
         within = f"within {params.sensing_radius:g} m"
@@ -83,7 +89,7 @@ class HazardNav:
                 Block("position", (3,), "m", "world"),
                 Block("point_position", (points, 3), "m", "own", "always, nearest point first"),
                 Block("point_hazardous", (points,), "1", "-", "once any drone came within its radius"),
-                Block("point_gap", (points,), "m", "-", f"distance to the nearest other live drone {within}, else that radius"),
+                Block("point_gap", (points,), "m", "-", f"to the nearest other live drone {within}"),
                 *drones.neighbor_blocks(self._slots, within),
             )),
             action=drones.ACTION,
@@ -215,7 +221,7 @@ class HazardNav:
         return coverage.contacts(apart, now.health > 0, 2 * self.params.drone_radius).sum(axis=(1, 2)) / 2
 
     def _taken(self, now: Snapshot, alive: Bool[np.ndarray, "n N"]) -> Float[np.ndarray, "n N P"]:
-        """Distance from each point to the nearest other live drone that drone i senses, capped at the radius."""
+        """Distance from each point to the nearest other live drone that drone i senses, capped."""
         radius = self.params.sensing_radius
         apart = coverage.distances(now.position, now.position)
         sensed = (apart <= radius) & alive[:, None, :] & ~np.eye(alive.shape[1], dtype=bool)

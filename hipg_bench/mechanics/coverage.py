@@ -32,7 +32,7 @@ def nearest(
 def contacts(
     distance: Float[np.ndarray, "B N N"], counts: Bool[np.ndarray, "B N"], reach: float
 ) -> Bool[np.ndarray, "B N N"]:
-    """Pairs of distinct agents that count and are nearer than ``reach`` m; symmetric, False on the diagonal."""
+    """Pairs of distinct agents that count and are nearer than ``reach`` m; symmetric."""
     xp = array_namespace(distance)
     others = ~xp.eye(distance.shape[-1], dtype=xp.bool)
     return (distance < reach) & counts[:, :, None] & counts[:, None, :] & others

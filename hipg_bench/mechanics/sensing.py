@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 class Sensed(NamedTuple):
     """The K nearest things each agent senses, nearest first."""
 
-    index: Int[np.ndarray, "B N K"]
+    which: Int[np.ndarray, "B N K"]
     """Which thing fills the slot; meaningless where the slot is empty."""
     seen: Bool[np.ndarray, "B N K"]
     """Whether the slot is filled."""
@@ -42,5 +42,5 @@ def gather(values: Float[np.ndarray, "B M D"], sensed: Sensed) -> Float[np.ndarr
     """Look up each slot's vector; empty slots hold zeros."""
     xp = array_namespace(values)
     rows = xp.arange(values.shape[0])[:, None, None]
-    found = values[rows, sensed.index]
+    found = values[rows, sensed.which]
     return xp.where(sensed.seen[..., None], found, xp.zeros_like(found))
