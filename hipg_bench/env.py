@@ -22,8 +22,8 @@ NEVER = -1.0
 """Death time of the living."""
 
 
-def _fields(spec: TaskSpec, family: Family) -> dict[str, int]:
-    """What an episode remembers, in the order of ``userdata``."""
+def memory_fields(spec: TaskSpec, family: Family) -> dict[str, int]:
+    """What an episode remembers: name to how many numbers, in the order of ``userdata``."""
     n = spec.num_agents
     common = {
         "health": n, "exposure": n, "toughness": n, "death_time": n, "death_cause": n,
@@ -35,7 +35,7 @@ def _fields(spec: TaskSpec, family: Family) -> dict[str, int]:
 def world_model(spec: TaskSpec, family: Family, *, visual: bool = False) -> mujoco.MjModel:
     """Compile a task's world; the state rows are the same with and without what only a camera sees."""
     scene = family.scene() if visual else without_visuals(family.scene())
-    scene.nuserdata = sum(_fields(spec, family).values())
+    scene.nuserdata = sum(memory_fields(spec, family).values())
     return scene.compile()
 
 
@@ -53,7 +53,8 @@ class Step:
             weighted, their sum is the reward; ``final_observation`` (B, N, O), ``final_state`` (B, S) and
             ``final_alive`` (B, N), those of the step itself, whether or not an episode ended; ``metrics``
             name to (B,), NaN but where an episode ended; ``end_reason`` (B,) str, empty but there;
-            ``episode_id`` (B,) and ``elapsed`` (B,) control steps of the episode that the observation is of.
+            ``episode_id`` (B,) and ``elapsed`` (B,) control steps of the episode that the observation is of;
+            ``final_rows`` (n, R) last rows of the n worlds whose episode ended, in their order.
     """
 
     observation: Float[np.ndarray, "B N O"]
@@ -92,7 +93,7 @@ class BatchEnv:
         self._sim = Sim(
             self.model,
             num_envs,
-            _fields(spec, family),
+            memory_fields(spec, family),
             decimation=family.physics_steps,
             derived=family.derived,
             threads=threads,
@@ -171,6 +172,7 @@ class BatchEnv:
             "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, np.flatnonzero(done)),
         }  # fmt: skip
         observation, state = observation.copy(), state.copy()
+        info["final_rows"] = self._sim.rows[done]
         if done.any():
             ids = np.flatnonzero(done)
             self._begin(ids, self._next_episode + np.arange(len(ids)))
@@ -264,6 +266,7 @@ class BatchEnv:
             "final_alive": self._sim.field["health"] > 0,
             "terms": {name: np.zeros(self.num_envs) for name in (*self.spec.weights, "physics")},
             "end_reason": np.full(self.num_envs, ""),
+            "final_rows": self._sim.rows[:0].copy(),
             "metrics": self._measure(self._now, np.empty(0, np.int64)),
         }  # fmt: skip
         info |= self._present(state)
