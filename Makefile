@@ -1,0 +1,48 @@
+# Every target sets up what it needs; `make` alone lists them.
+#   make evaluate AGENT=random ARGS="--quick"
+#   make test ARGS="-k laws"
+.DEFAULT_GOAL := help
+.PHONY: help setup evaluate test test-slow lint format bench golden clean
+
+BIN := .venv/bin
+READY := .venv/.ready
+AGENT ?= mappo_minhealth
+ARGS ?=
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+setup: $(READY) ## virtual environment, pinned packages, libraries for video
+
+$(READY): pyproject.toml constraints.txt scripts/setup.sh
+	scripts/setup.sh
+
+evaluate: $(READY) ## score an agent on the standard suite, with films
+	$(BIN)/hipg-bench evaluate --agent $(AGENT) $(ARGS)
+
+test: $(READY) ## the tests, some minutes
+	$(BIN)/pytest -m "not slow" $(ARGS)
+
+test-slow: $(READY) ## parity and calibration over thousands of episodes, long
+	$(BIN)/pytest -m slow $(ARGS)
+
+lint: $(READY) ## style, types, layers, spelling
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+	$(BIN)/codespell
+
+format: $(READY) ## mend style where a tool can
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY) ## environment steps per second
+	$(BIN)/hipg-bench bench $(ARGS)
+
+golden: $(READY) ## record the golden episodes anew, after a wanted change of behaviour
+	$(BIN)/pytest tests/test_golden.py --record-golden
+
+clean: ## remove caches and builds; the virtual environment and runs/ stay
+	rm -rf build dist .pytest_cache .ruff_cache .hypothesis .benchmarks .import_linter_cache
+	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
