@@ -7,10 +7,16 @@
 (64, 4)
 """
 
-from hipg_bench.env import BatchEnv, Step
-from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.registry import make, tagged, task_spec, tasks
-from hipg_bench.spec import TaskSpec
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hipg_bench.env import BatchEnv, Step
+    from hipg_bench.layout import Block, Layout, TaskLayout
+    from hipg_bench.registry import make, tagged, task_spec, tasks
+    from hipg_bench.spec import TaskSpec
 
 __version__ = "0.1.0"
 
@@ -26,3 +32,18 @@ __all__ = [
     "task_spec",
     "tasks",
 ]
+
+_HOMES = {
+    "env": ("BatchEnv", "Step"),
+    "layout": ("Block", "Layout", "TaskLayout"),
+    "registry": ("make", "tagged", "task_spec", "tasks"),
+    "spec": ("TaskSpec",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use: the command line answers before MuJoCo is loaded, and may choose its GL first."""
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"hipg_bench.{module}"), name)
+    raise AttributeError(f"module 'hipg_bench' has no attribute {name!r}")

@@ -235,6 +235,10 @@ class BatchEnv:
             current[:, agent] = np.minimum(current[:, agent], value)
         return forked
 
+    def recall(self, rows: Float[np.ndarray, "n R"], name: str) -> Float[np.ndarray, "n size"]:
+        """What saved worlds remember, by name, e.g. ``death_time`` (control steps, `NEVER` while alive)."""
+        return self._sim.userdata_of(rows, name)
+
     def close(self) -> None:
         """Refuse further use."""
         self._closed = True
