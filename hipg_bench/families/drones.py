@@ -121,14 +121,19 @@ def neighbors(
     health: Float[np.ndarray, "n N"],
     radius: float,
     slots: int,
+    *,
+    live_only: bool = False,
 ) -> dict[str, np.ndarray]:
-    """What each drone senses of the nearest other drones, dead ones included.
+    """What each drone senses of the nearest other drones, dead ones included unless ``live_only``.
 
     Returns:
         The blocks of `neighbor_blocks`.
     """
     distance = coverage.distances(position, position)
-    sensed = sensing.nearest_within(distance, _others(position.shape[1]), radius, slots)
+    visible = _others(position.shape[1])
+    if live_only:
+        visible = visible & (health > 0)[:, None, :]
+    sensed = sensing.nearest_within(distance, visible, radius, slots)
     of = np.concatenate([position, velocity, health[..., None]], axis=-1)
     own = np.concatenate([position, velocity, np.zeros_like(health)[..., None]], axis=-1)
     found = np.where(sensed.seen[..., None], sensing.gather(of, sensed) - own[:, :, None], 0.0)

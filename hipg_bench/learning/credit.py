@@ -1,0 +1,48 @@
+"""Who gets the credit: one pure function per arm of the paper's comparison.
+
+Each maps what a central critic knows to the weight Psi_i that multiplies agent i's log-probability
+gradient (eqn:policy_gradients_multi_agent).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def central(
+    target: Float[Tensor, "X"], value: Float[Tensor, "X"], health: Float[Tensor, "X N"]
+) -> Float[Tensor, "X N"]:
+    """Psi_i = h_i (V_targ - V(s)): the team's advantage, the same for every live agent."""
+    return health * (target - value)[:, None]
+
+
+def min_health(
+    target: Float[Tensor, "X"], without: Float[Tensor, "X N"], health: Float[Tensor, "X N"]
+) -> Float[Tensor, "X N"]:
+    """Psi_i = h_i (V_targ - V(s with only h_i := 0)), eqn:min_health_baseline_ppo.
+
+    Args:
+        target: V_targ of eqn:value_target.
+        without: the critic's value of the same state with agent i dead.
+        health: h_i, in [0, 1].
+    """
+    return health * (target[:, None] - without)
+
+
+def with_each_dead(
+    state: Float[Tensor, "X S"], health_columns: np.ndarray, dead_value: float
+) -> Float[Tensor, "X N S"]:
+    """N copies of each joint state, in the i-th of which only agent i's health is set to 0."""
+    n = len(health_columns)
+    copies = state[:, None, :].repeat(1, n, 1)
+    copies[:, torch.arange(n), torch.as_tensor(health_columns)] = dead_value
+    return copies
+
+
+def normalized(psi: Float[Tensor, "X N"], live: Bool[Tensor, "X N"]) -> Float[Tensor, "X N"]:
+    """Zero mean and unit deviation over live samples; 0 for the dead."""
+    chosen = psi[live]
+    return torch.where(live, (psi - chosen.mean()) / (chosen.std() + 1e-8), 0.0)

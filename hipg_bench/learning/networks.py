@@ -1,0 +1,119 @@
+"""The actor, the central critic and running normalisation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hipg_bench.policies.network import CLIP
+
+
+class RunningNorm(nn.Module):
+    """Running mean and scale of a vector, by Chan's parallel update.
+
+    Columns in ``fixed`` pass through unchanged: health must, since a critic is asked about deaths it
+    has hardly seen, and dividing by their tiny deviation would throw its input far off.
+    """
+
+    count: Tensor
+    mean: Tensor
+    square: Tensor
+    free: Tensor
+
+    def __init__(self, size: int, fixed: np.ndarray | None = None) -> None:
+        super().__init__()
+        free = torch.ones(size, dtype=torch.bool)
+        if fixed is not None:
+            free[torch.as_tensor(fixed)] = False
+        self.register_buffer("free", free)
+        self.register_buffer("count", torch.tensor(1e-4, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("square", torch.full((size,), 1e-4, dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, x: Float[Tensor, "X size"]) -> None:
+        """Take in a batch."""
+        x = x.double()
+        fresh = x.mean(0) - self.mean
+        total = self.count + len(x)
+        self.square += x.var(0, unbiased=False) * len(x) + fresh**2 * self.count * len(x) / total
+        self.mean += fresh * len(x) / total
+        self.count.copy_(total)
+
+    @property
+    def offset(self) -> Float[Tensor, "size"]:
+        """What is subtracted."""
+        return torch.where(self.free, self.mean, 0.0).float()
+
+    @property
+    def scale(self) -> Float[Tensor, "size"]:
+        """What is divided by."""
+        return torch.where(self.free, (self.square / self.count).sqrt().clamp(min=1e-2), 1.0).float()
+
+    def forward(self, x: Float[Tensor, "... size"]) -> Float[Tensor, "... size"]:
+        """Normalise, cut to +-CLIP."""
+        return ((x - self.offset) / self.scale).clamp(-CLIP, CLIP)
+
+
+def mlp(sizes: tuple[int, ...], activation: type[nn.Module], last_gain: float) -> nn.Sequential:
+    """Linear layers with orthogonal weights; no activation after the last."""
+    layers: list[nn.Module] = []
+    for k, (width, wider) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        last = k == len(sizes) - 2
+        linear = nn.Linear(width, wider)
+        nn.init.orthogonal_(linear.weight, last_gain if last else math.sqrt(2))
+        nn.init.zeros_(linear.bias)
+        layers += [linear] if last else [linear, activation()]
+    return nn.Sequential(*layers)
+
+
+class Actor(nn.Module):
+    """A Gaussian policy shared by all agents: each acts on its own observation alone."""
+
+    def __init__(self, observation_size: int, action_size: int, hidden: tuple[int, ...], std: float) -> None:
+        super().__init__()
+        self.norm = RunningNorm(observation_size)
+        self.body = mlp((observation_size, *hidden, action_size), nn.Tanh, 0.01)
+        self.log_std = nn.Parameter(torch.full((action_size,), math.log(std)))
+
+    def forward(self, observation: Float[Tensor, "... O"]) -> torch.distributions.Normal:
+        """Distribution of each action coordinate."""
+        return torch.distributions.Normal(
+            self.body(self.norm(observation)), self.log_std.exp(), validate_args=False
+        )
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """What `hipg_bench.policies.network.save_network` writes: the mean action's network."""
+        linears = [layer for layer in self.body if isinstance(layer, nn.Linear)]
+        out = {"observation.mean": self.norm.offset, "observation.scale": self.norm.scale}
+        for k, layer in enumerate(linears):
+            out |= {f"layer{k}.weight": layer.weight, f"layer{k}.bias": layer.bias}
+        return {name: tensor.detach().numpy().copy() for name, tensor in out.items()}
+
+
+class Critic(nn.Module):
+    """A central value function of the joint state and the share of the horizon that has passed.
+
+    It predicts returns normalised by their running mean and deviation.
+    """
+
+    def __init__(self, state_size: int, hidden: tuple[int, ...], health_columns: np.ndarray) -> None:
+        super().__init__()
+        self.norm = RunningNorm(state_size, fixed=health_columns)
+        self.returns = RunningNorm(1)
+        self.body = mlp((state_size + 1, *hidden, 1), nn.ELU, 1.0)
+
+    def normalized(
+        self, state: Float[Tensor, "... S"], elapsed: Float[Tensor, "..."]
+    ) -> Float[Tensor, "..."]:
+        """Value in units of the running deviation of returns."""
+        x = torch.cat([self.norm(state), elapsed[..., None]], dim=-1)
+        return self.body(x)[..., 0]
+
+    def forward(self, state: Float[Tensor, "... S"], elapsed: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """Value in units of reward."""
+        return self.normalized(state, elapsed) * self.returns.scale + self.returns.offset

@@ -1,0 +1,188 @@
+"""Scripted experts: what a team that knows everything does, and the same team blind to the hazard.
+
+They act on the joint state, so they are never ranked. They fix the reference anchor of a task, and
+the gap between the aware and the blind variant is its hazard leverage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+
+from hipg_bench.errors import UnknownNameError, hint
+from hipg_bench.layout import TaskLayout
+from hipg_bench.registry import family_of
+from hipg_bench.spec import TaskSpec
+
+_CLEARANCE = 0.04
+"""How far outside a hazard's radius the aware expert stays, m."""
+_STIFFNESS, _DAMPING = 6.0, 1.33
+"""Thrust per m to go, and per m/s of speed: critically damped for 6 N of thrust and 4 N s/m of drag."""
+
+Places = Float[np.ndarray, "B N 3"]
+
+
+class Scripted:
+    """The expert for a spec's family.
+
+    Attributes:
+        privileged: it acts on the joint state.
+    """
+
+    privileged = True
+
+    def __init__(self, spec: TaskSpec, *, blind: bool = False) -> None:
+        """Choose the plan of the spec's family.
+
+        Raises:
+            UnknownNameError: nobody has written an expert for that family.
+        """
+        if spec.family not in _PLANS:
+            raise UnknownNameError(f"no scripted expert for family {spec.family!r}{hint(spec.family, _PLANS)}")
+        self._spec = spec
+        # a hazard that cannot kill is no reason to keep away
+        self._blind = blind or spec.params["hazard_peak"] == 0
+        self._layout = family_of(spec).layout
+
+    def initial_state(self, seed: int, episode_id: Int[np.ndarray, "B"], num_agents: int) -> None:
+        """Remember nothing: the state says it all."""
+
+    def act(
+        self, state: Float[np.ndarray, "B S"], memory: None, alive: Bool[np.ndarray, "B N"]
+    ) -> tuple[Float[np.ndarray, "B N A"], None]:
+        """Fly every live drone towards its place in the plan."""
+        plan = _PLANS[self._spec.family]
+        return plan(self._spec, self._layout, state.astype(np.float64), alive, self._blind), memory
+
+
+def _navigate(
+    spec: TaskSpec, layout: TaskLayout, state: Float[np.ndarray, "B S"], alive: Bool[np.ndarray, "B N"], blind: bool
+) -> Float[np.ndarray, "B N A"]:
+    """Cover every point; watch hazardous ones from their edge."""
+    position = layout.state.view(state, "position")
+    velocity = layout.state.view(state, "velocity")
+    point = layout.state.view(state, "point_position")
+    hazardous = layout.state.view(state, "point_hazardous") > 0
+    if blind:
+        return _fly(position, velocity, _assign(position, point, alive))
+    margin = spec.params["hazard_radius"] + _CLEARANCE
+    # hazards that do not exist are put where nobody passes
+    hazard = np.where(hazardous[..., None], point, 1e3)
+    target = _outside(_assign(position, point, alive), hazard, margin, towards=position)
+    return _fly(position, velocity, _around(position, target, hazard, margin))
+
+
+def _relay(
+    spec: TaskSpec, layout: TaskLayout, state: Float[np.ndarray, "B S"], alive: Bool[np.ndarray, "B N"], blind: bool
+) -> Float[np.ndarray, "B N A"]:
+    """Form an evenly spaced chain between the terminals: straight if blind, else around the hazard."""
+    position = layout.state.view(state, "position")
+    velocity = layout.state.view(state, "velocity")
+    terminal = layout.state.view(state, "terminal_position")
+    hazard = layout.state.view(state, "hazard_position")
+    margin = spec.params["hazard_radius"] + _CLEARANCE
+    bend = terminal.mean(axis=1) if blind else _bend(terminal, hazard, margin)
+    # a spare drone or two near each relay keeps the chain whole when one is lost on the way
+    chain = _along(terminal, bend, alive)
+    target = _assign(position, chain, alive)
+    if not blind:
+        target = _around(position, target, hazard[:, None], margin)
+    return _fly(position, velocity, target)
+
+
+_PLANS: Mapping[str, Callable[..., Float[np.ndarray, "B N A"]]] = {"hazard_nav": _navigate, "hazard_comm": _relay}
+
+
+def _fly(position: Places, velocity: Places, target: Places) -> Places:
+    """Thrust towards a target, braking in time."""
+    return np.clip(_STIFFNESS * (target - position) - _DAMPING * velocity, -1.0, 1.0)
+
+
+def _assign(position: Places, target: Float[np.ndarray, "B P 3"], alive: Bool[np.ndarray, "B N"]) -> Places:
+    """Give each live drone a target, at the least total distance; the others stay where they are."""
+    assigned = position.copy()
+    cost = np.linalg.norm(position[:, :, None] - target[:, None], axis=-1)
+    for b, live in enumerate(alive):
+        here = np.flatnonzero(live)
+        usable = np.flatnonzero(np.isfinite(target[b, :, 0]))
+        rows, columns = linear_sum_assignment(cost[b][np.ix_(here, usable)])
+        assigned[b, here[rows]] = target[b, usable[columns]]
+    return assigned
+
+
+def _outside(target: Places, hazard: Float[np.ndarray, "B P 3"], margin: float, towards: Places) -> Places:
+    """Move targets that lie in a hazard to its edge, on the side of the drone that is to go there."""
+    for k in range(hazard.shape[1]):
+        centre = hazard[:, k, None]
+        inside = np.linalg.norm(target - centre, axis=-1) < margin
+        away = towards - centre
+        away = away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-9)
+        target = np.where(inside[..., None], centre + margin * away, target)
+    return target
+
+
+def _around(position: Places, target: Places, hazard: Float[np.ndarray, "B P 3"], margin: float) -> Places:
+    """Replace targets behind a hazard by a waypoint beside it; whoever is inside one leaves it first."""
+    aim = target
+    for k in range(hazard.shape[1]):
+        centre = hazard[:, k, None]
+        path = target - position
+        length = np.maximum(np.linalg.norm(path, axis=-1, keepdims=True), 1e-9)
+        share = np.clip(((centre - position) * path).sum(-1, keepdims=True) / length**2, 0.0, 1.0)
+        closest = position + share * path - centre
+        gap = np.linalg.norm(closest, axis=-1, keepdims=True)
+        blocked = (gap < margin - 1e-6) & (share > 0) & (share < 1)
+        aim = np.where(blocked, centre + 1.15 * margin * closest / np.maximum(gap, 1e-9), aim)
+        out = position - centre
+        depth = np.linalg.norm(out, axis=-1, keepdims=True)
+        aim = np.where(depth < margin - 2 * _CLEARANCE, centre + 1.3 * margin * out / np.maximum(depth, 1e-9), aim)
+    return aim
+
+
+def _bend(
+    terminal: Float[np.ndarray, "B 2 3"], hazard: Float[np.ndarray, "B 3"], margin: float
+) -> Float[np.ndarray, "B 3"]:
+    """The corner of the shortest two-legged horizontal path between the terminals that clears the hazard."""
+    line = terminal[:, 1] - terminal[:, 0]
+    line = line / np.linalg.norm(line, axis=-1, keepdims=True)
+    side = np.stack([-line[:, 1], line[:, 0], np.zeros(len(line))], axis=-1)
+    middle = terminal.mean(axis=1)
+    off = hazard - middle
+    # bend to the side the hazard is not on
+    side = np.where((off * side).sum(-1, keepdims=True) > 0, -side, side)
+    foot = middle + (off * line).sum(-1, keepdims=True) * line
+    corner = foot
+    for reach in np.linspace(0.9, 0.0, 37):
+        candidate = foot + reach * side
+        clear = np.minimum(
+            _gap_to_leg(terminal[:, 0], candidate, hazard), _gap_to_leg(candidate, terminal[:, 1], hazard)
+        )
+        corner = np.where((clear >= margin)[:, None], candidate, corner)
+    return corner
+
+
+def _gap_to_leg(
+    start: Float[np.ndarray, "B 3"], end: Float[np.ndarray, "B 3"], point: Float[np.ndarray, "B 3"]
+) -> Float[np.ndarray, "B"]:
+    """Distance from a point to the segment start-end."""
+    leg = end - start
+    share = np.clip(((point - start) * leg).sum(-1) / np.maximum((leg * leg).sum(-1), 1e-9), 0.0, 1.0)
+    return np.linalg.norm(start + share[:, None] * leg - point, axis=-1)
+
+
+def _along(
+    terminal: Float[np.ndarray, "B 2 3"], bend: Float[np.ndarray, "B 3"], alive: Bool[np.ndarray, "B N"]
+) -> Float[np.ndarray, "B N 3"]:
+    """Evenly spaced relay places on the path terminal-bend-terminal, one per live drone; NaN beyond."""
+    first = np.linalg.norm(bend - terminal[:, 0], axis=-1)[:, None]
+    second = np.linalg.norm(terminal[:, 1] - bend, axis=-1)[:, None]
+    live = alive.sum(axis=1, keepdims=True)
+    number = np.arange(1, alive.shape[1] + 1)[None]
+    at = np.where(number <= live, number / (live + 1) * (first + second), np.nan)
+    early, late = (at / first)[..., None], ((at - first) / second)[..., None]
+    on_first = terminal[:, None, 0] + early * (bend - terminal[:, 0])[:, None]
+    on_second = bend[:, None] + late * (terminal[:, 1] - bend)[:, None]
+    return np.where((at <= first)[..., None], on_first, on_second)
