@@ -192,16 +192,19 @@ class BatchEnv:
         """Put saved worlds into places ``ids``; return what their agents see now, reward 0.
 
         Raises:
-            HipgError: rows of another task, or ids outside 0..B-1.
+            HipgError: rows of another task, or ids outside 0..B-1 or named twice.
         """
         self._check_open()
         ids = np.atleast_1d(np.asarray(ids))
         expected = (len(ids), self._sim.rows.shape[1])
-        if rows.shape != expected or ids.min() < 0 or ids.max() >= self.num_envs:
+        inside = (ids >= 0) & (ids < self.num_envs)
+        if rows.shape != expected or not inside.all() or len(np.unique(ids)) < len(ids):
             raise HipgError(
-                f"{self.spec.task}: rows of shape {expected} for ids in 0..{self.num_envs - 1} are allowed, "
-                f"got {rows.shape} for {ids.tolist()}"
+                f"{self.spec.task}: rows of shape {expected} for distinct ids in 0..{self.num_envs - 1} are "
+                f"allowed, got {rows.shape} for {ids.tolist()}"
             )
+        order = np.argsort(ids)  # the engine takes ids in ascending order only
+        ids, rows = ids[order], rows[order]
         self._sim.reset(ids)
         self._sim.rows[ids] = rows
         self._sim.refresh(ids)

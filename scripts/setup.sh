@@ -67,8 +67,8 @@ install_packages() {
     torch=$(grep -E '^torch==' constraints.txt)
     say "installing the packages pinned in constraints.txt (a few minutes the first time)"
     # torch by itself first: where an index with the small CPU build is configured, that one is taken
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$torch"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+    .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt "$torch"
+    .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
 }
 
 # --- libraries for offscreen rendering --------------------------------------------------------------

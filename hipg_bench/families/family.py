@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -35,6 +35,7 @@ class Harm:
     cause: Int[np.ndarray, "B N"]
 
 
+@runtime_checkable
 class Family(Protocol):
     """Physics and rules of a family, for one spec.
 

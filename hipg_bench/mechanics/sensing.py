@@ -21,7 +21,7 @@ class Sensed(NamedTuple):
 
 
 def nearest_within(
-    distance: Float[np.ndarray, "B N M"], visible: Bool[np.ndarray, "B N M"], radius: float, slots: int
+    distance: Float[np.ndarray, "B N M"], visible: Bool[np.ndarray, "#B #N M"], radius: float, slots: int
 ) -> Sensed:
     """Fill each agent's slots with the nearest visible things within ``radius`` m.
 

@@ -1,0 +1,217 @@
+"""Laws of the worlds behind every task: rows, forks, forces, looks, and what divergence may touch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+from play import action, actions, flat, outcomes, play, same
+
+import hipg_bench
+from hipg_bench import BatchEnv, make
+from hipg_bench.env import world_model
+from hipg_bench.registry import family_of
+
+TASKS = sorted(hipg_bench.tasks())
+KIND = mujoco.mjtObj
+NAMED = {
+    "nbody": KIND.mjOBJ_BODY, "njnt": KIND.mjOBJ_JOINT, "ngeom": KIND.mjOBJ_GEOM, "nsite": KIND.mjOBJ_SITE,
+    "ncam": KIND.mjOBJ_CAMERA, "nlight": KIND.mjOBJ_LIGHT, "nu": KIND.mjOBJ_ACTUATOR,
+    "nsensor": KIND.mjOBJ_SENSOR, "nmat": KIND.mjOBJ_MATERIAL, "ntex": KIND.mjOBJ_TEXTURE,
+    "nmesh": KIND.mjOBJ_MESH, "ntendon": KIND.mjOBJ_TENDON, "neq": KIND.mjOBJ_EQUALITY,
+}  # fmt: skip
+"""Model sizes and the kind of element they count."""
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def env(request: pytest.FixtureRequest) -> BatchEnv:
+    return make(request.param, 4, threads=1, horizon=30)
+
+
+@pytest.fixture(scope="module")
+def visual(env: BatchEnv) -> mujoco.MjModel:
+    return world_model(env.spec, family_of(env.spec), visual=True)
+
+
+def own_actuators(env: BatchEnv, agent: int) -> np.ndarray:
+    """(nu,) the actuators that move an agent, by the name of its bodies and not by their group.
+
+    An actuator acts on a joint of one tree of bodies, and no two agents share a tree.
+    """
+    model = env.model
+    tree = model.dof_treeid[model.jnt_dofadr[model.actuator_trnid[:, 0]]]
+    first = tree[agent * model.nu // env.num_agents]
+    return tree == first
+
+
+def actuator_forces(env: BatchEnv, world: int, control: float | None = None) -> np.ndarray:
+    """(nu,) forces on a plain MjData loaded with the world, its disable mask included."""
+    model, data = env._sim.batch.get_model(world), env._sim.batch.get_data(world)
+    if control is not None:
+        data.ctrl[:] = control
+    mujoco.mj_forward(model, data)
+    return data.actuator_force.copy()
+
+
+def everything_but_control(env: BatchEnv) -> np.ndarray:
+    """(B, R') all that evolves, without the actuators' inputs of the last step."""
+    rows, kind = env.rows, mujoco.mjtState
+    start = mujoco.mj_stateSize(env.model, int(kind.mjSTATE_INTEGRATION) & (int(kind.mjSTATE_CTRL) - 1))
+    return np.delete(rows, np.s_[start : start + env.model.nu], axis=1)
+
+
+def test_the_dead_exert_no_force_whatever_they_are_told(env: BatchEnv):
+    for agent in (0, env.num_agents - 1):
+        play(env, env.reset(), 3)
+        step = env.load_rows(np.arange(4), env.fork(env.rows, {agent: 0.0}))
+        env.step(actions(env, step))
+        mine = own_actuators(env, agent)
+        assert mine.sum() == env.model.nu / env.num_agents
+        for told in (None, 1.0, -1.0):
+            force = actuator_forces(env, 0, told)
+            assert (force[mine] == 0).all()
+            assert told is None or (force[~mine] != 0).any(), "the living must be able to act"
+
+
+def test_what_the_dead_are_told_changes_nothing(env: BatchEnv):
+    after: list[np.ndarray] = []
+    for told in (0.0, 1.0, -1.0, 1e9, np.nan):
+        step = env.reset(np.array([3, 1, 5, 9]))
+        step = env.load_rows(np.arange(4), env.fork(env.rows, {1: 0.0}))
+        for _ in range(5):
+            command = actions(env, step)
+            command[:, 1] = told
+            step = env.step(command)
+        after.append(everything_but_control(env))
+    for rows in after[1:]:
+        assert same(rows, after[0])
+
+
+def test_a_fork_kills_exactly_whom_it_names(env: BatchEnv):
+    play(env, env.reset(), 4)
+    rows, victim = env.rows, env.num_agents // 2
+    alive = env.load_rows(np.arange(4), rows).info["health"]
+    forked = env.fork(rows, {victim: 0.0})
+    assert same(rows, env.rows), "the fork must not touch the rows it came from"
+    step = env.load_rows(np.arange(4), forked)
+    others = np.arange(env.num_agents) != victim
+    assert (step.info["health"][:, victim] == 0).all()
+    assert same(step.info["health"][:, others], alive[:, others])
+    # nothing but the victim's health and its time of death differs
+    differing = (forked != rows).any(axis=0).sum()
+    assert differing == 2
+    assert not env.step(actions(env, step)).info["final_alive"][:, victim].any()
+
+
+def test_saved_rows_go_on_bit_for_bit(env: BatchEnv):
+    first = env.reset(np.array([0, 1, 2, 3]))
+    middle = play(env, first, 12)[-1]
+    rows = env.rows
+    ahead = outcomes(env, middle, play(env, middle, 25))
+    other = make(env.spec, 6, threads=2)
+    play(other, other.reset(), 7)
+    places = np.array([5, 0, 3, 2])
+    step = other.load_rows(places, rows)
+    assert same(step.observation[places], middle.observation)
+    assert same(step.info["state"][places], middle.info["state"])
+    again = outcomes(other, step, play(other, step, 25))
+    shared = [key for key in ahead if key in again]
+    assert len(shared) >= 4 * 10
+    for key in shared:
+        for name, value in ahead[key].items():
+            assert same(value, again[key][name]), (key, name)
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e30], ids=["nan", "huge"])
+def test_divergence_ends_only_its_own_episode(
+    env: BatchEnv, value: float, tmp_path: object, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(str(tmp_path))  # MuJoCo writes its warnings to a file in the working directory
+    calm, broken = env.reset(), make(env.spec, 4, threads=2)
+    disturbed = broken.reset()
+    for t in range(34):
+        was, was_calm = disturbed, calm
+        command = np.stack([action(env, b, t) for b in range(4)])
+        if t == 6:
+            broken._sim.velocity[2] = value
+        calm, disturbed = env.step(command), broken.step(command)
+        for name, array in flat(disturbed).items():
+            if array.dtype.kind == "f" and "metrics" not in name:
+                assert np.isfinite(array).all(), name
+        if t == 6:
+            assert disturbed.info["end_reason"].tolist()[2] == "physics"
+            assert disturbed.terminated[2]
+            assert not disturbed.truncated[2]
+            assert disturbed.info["metrics"]["return"][2] == pytest.approx(env.spec.floor, abs=1e-9)
+            assert disturbed.info["terms"]["physics"][2] == disturbed.reward[2]
+            assert disturbed.info["elapsed"][2] == 0
+            fresh = make(env.spec, 1, threads=1).reset(disturbed.info["episode_id"][[2]])
+            assert same(fresh.observation[0], disturbed.observation[2])
+        for b in (0, 1, 3):
+            if was.info["episode_id"][b] != b or was_calm.info["episode_id"][b] != b:
+                continue
+            for name in (
+                "reward",
+                "terminated",
+                "info.final_observation",
+                "info.final_state",
+                "info.end_reason",
+            ):
+                assert same(flat(calm)[name][b], flat(disturbed)[name][b]), (t, name)
+    assert (disturbed.info["end_reason"] != "physics").all()
+
+
+def test_every_element_has_a_name(visual: mujoco.MjModel):
+    for size, kind in NAMED.items():
+        nameless = [i for i in range(getattr(visual, size)) if not mujoco.mj_id2name(visual, int(kind), i)]
+        assert not nameless, (size, nameless)
+    assert visual.ncam >= 2
+
+
+def test_looks_do_not_change_the_world(env: BatchEnv, visual: mujoco.MjModel):
+    """Rows fit both models, and a plain MjData moves bit for bit alike in both."""
+    play(env, env.reset(), 5)
+    spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    size = mujoco.mj_stateSize(env.model, spec)
+    assert size == mujoco.mj_stateSize(visual, spec) == env.rows.shape[1]
+    assert visual.ngeom > env.model.ngeom, "there must be something to see"
+    assert same(visual.body_mass, env.model.body_mass)
+    assert same(visual.body_inertia, env.model.body_inertia)
+    ends: list[np.ndarray] = []
+    for model in (env.model, visual):
+        data, row = mujoco.MjData(model), np.empty(size)
+        mujoco.mj_setState(model, data, env.rows[0], spec)
+        mujoco.mj_step(model, data, 20 * env.decimation)
+        mujoco.mj_getState(model, data, row, spec)
+        ends.append(row)
+    assert same(*ends)
+
+
+def refuse(env: BatchEnv) -> list[tuple[Callable[[], object], str]]:
+    """Wrong uses and what their error must name."""
+    rows, n = env.rows, env.num_agents
+    bad = np.zeros((4, n, env.action_size))
+    bad[2, 1, 0] = np.nan
+    return [
+        (lambda: env.step(np.zeros((4, n + 1, env.action_size))), str((4, n, env.action_size))),
+        (lambda: env.step(bad), "env 2, agent 1"),
+        (lambda: env.reset(np.array([0, 1, 2, -1])), ">= 0"),
+        (lambda: env.load_rows(np.array([4]), rows[:1]), "0..3"),
+        (lambda: env.load_rows(np.array([1, 1]), rows[:2]), "distinct"),
+        (lambda: env.load_rows(np.array([0]), rows[:1, :-1]), str(rows.shape[1])),
+        (lambda: env.fork(rows, {n: 0.0}), f"0..{n - 1}"),
+        (lambda: env.fork(rows, {0: 1.5}), "1.5"),
+    ]
+
+
+def test_wrong_uses_are_refused_and_harm_nothing(env: BatchEnv):
+    step = env.reset()
+    rows = env.rows
+    for use, message in refuse(env):
+        with pytest.raises(hipg_bench.errors.HipgError) as refusal:
+            use()
+        assert message in str(refusal.value)
+    assert same(rows, env.rows)
+    env.step(actions(env, step))
