@@ -12,12 +12,14 @@ from hipg_bench.errors import SpecError, UnknownNameError, hint
 from hipg_bench.families.family import Family
 from hipg_bench.families.hazard_comm import HazardComm
 from hipg_bench.families.hazard_nav import HazardNav
+from hipg_bench.families.multiwalker import MultiWalker
 from hipg_bench.paths import data_folder
 from hipg_bench.spec import TaskSpec
 
 FAMILIES: Mapping[str, Callable[[TaskSpec], Family]] = {
     "hazard_nav": HazardNav,
     "hazard_comm": HazardComm,
+    "multiwalker": MultiWalker,
 }
 """Name in a task file to the class with its rules."""
 

@@ -89,8 +89,8 @@ class Family(Protocol):
         """Terms of the team reward, before weights."""
         ...
 
-    def terminated(self, now: Any) -> tuple[Bool[np.ndarray, "B"], str]:
-        """Episodes that the rules end now, and the reason's name."""
+    def terminated(self, now: Any) -> tuple[Bool[np.ndarray, "B"], str | np.ndarray]:
+        """Episodes that the rules end now, and the reason's name: one for all, or (B,) of them."""
         ...
 
     def observe(self, now: Any) -> Float[np.ndarray, "n N O"]:
