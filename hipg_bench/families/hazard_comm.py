@@ -104,7 +104,11 @@ class HazardComm:
     def scene(self) -> mujoco.MjSpec:
         """N drones; terminals and hazard are mocap bodies, so that they are part of the row."""
         scene = drones.drone_scene(self.spec, self.params)
-        for name, kind in (("terminal0", "terminal.xml"), ("terminal1", "terminal.xml"), ("hazard", "hazard.xml")):
+        for name, kind in (
+            ("terminal0", "terminal.xml"),
+            ("terminal1", "terminal.xml"),
+            ("hazard", "hazard.xml"),
+        ):
             add_marker(scene, name, kind)
         return scene
 
@@ -183,7 +187,9 @@ class HazardComm:
                 "position": now.position,
                 "terminal_position": now.terminal[:, None] - now.position[:, :, None],
                 "route": self._routes(now),
-                **drones.neighbors(now.position, now.velocity, now.health, radius, self._slots, live_only=True),
+                **drones.neighbors(
+                    now.position, now.velocity, now.health, radius, self._slots, live_only=True
+                ),
                 "wreck_seen": wrecks.seen,
                 "wreck_position": np.where(wrecks.seen[..., None], gap, 0.0),
             },
@@ -204,7 +210,9 @@ class HazardComm:
             now.health.shape[:1],
         )
 
-    def measure(self, sim: Sim, ids: Int[np.ndarray, "n"], now: Snapshot) -> dict[str, Float[np.ndarray, "n"]]:
+    def measure(
+        self, sim: Sim, ids: Int[np.ndarray, "n"], now: Snapshot
+    ) -> dict[str, Float[np.ndarray, "n"]]:
         """Share of connected steps, step of the first link, mean relays in the shortest chain."""
         field = sim.field
         linked = field["connected"][ids, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -62,7 +63,7 @@ class RunningNorm(nn.Module):
 def mlp(sizes: tuple[int, ...], activation: type[nn.Module], last_gain: float) -> nn.Sequential:
     """Linear layers with orthogonal weights; no activation after the last."""
     layers: list[nn.Module] = []
-    for k, (width, wider) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for k, (width, wider) in enumerate(itertools.pairwise(sizes)):
         last = k == len(sizes) - 2
         linear = nn.Linear(width, wider)
         nn.init.orthogonal_(linear.weight, last_gain if last else math.sqrt(2))

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from safetensors.numpy import save_file
 
 from hipg_bench.errors import BundleError
+from hipg_bench.paths import replacing
 
 FORMAT = "hipg-mlp-1"
 """What the metadata's ``format`` says: a tanh MLP over normalised observations."""
@@ -66,9 +67,9 @@ def save_network(tensors: Mapping[str, np.ndarray], path: Path) -> None:
             ``layer<k>.bias`` (out,) from the first layer to the action.
         path: where.
     """
-    partial = path.with_suffix(".partial")
-    save_file({name: np.ascontiguousarray(t, np.float32) for name, t in tensors.items()}, partial, {"format": FORMAT})
-    partial.replace(path)
+    plain = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
+    with replacing(path) as temporary:
+        save_file(plain, temporary, {"format": FORMAT})
 
 
 def load_network(path: Path) -> MLP:
@@ -90,7 +91,9 @@ def load_network(path: Path) -> MLP:
         raise BundleError(f"{path}: cannot be read: {error}") from error
     for name, tensor in tensors.items():
         if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
-            raise BundleError(f"{path}: {name} must be finite float32, got {tensor.dtype} or values that are not")
+            raise BundleError(
+                f"{path}: {name} must be finite float32, got {tensor.dtype} or values that are not"
+            )
     if (tensors["observation.scale"] <= 0).any():
         raise BundleError(f"{path}: observation.scale must be > 0")
     return MLP(tensors)

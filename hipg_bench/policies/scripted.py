@@ -41,7 +41,9 @@ class Scripted:
             UnknownNameError: nobody has written an expert for that family.
         """
         if spec.family not in _PLANS:
-            raise UnknownNameError(f"no scripted expert for family {spec.family!r}{hint(spec.family, _PLANS)}")
+            raise UnknownNameError(
+                f"no scripted expert for family {spec.family!r}{hint(spec.family, _PLANS)}"
+            )
         self._spec = spec
         # a hazard that cannot kill is no reason to keep away
         self._blind = blind or spec.params["hazard_peak"] == 0
@@ -59,7 +61,11 @@ class Scripted:
 
 
 def _navigate(
-    spec: TaskSpec, layout: TaskLayout, state: Float[np.ndarray, "B S"], alive: Bool[np.ndarray, "B N"], blind: bool
+    spec: TaskSpec,
+    layout: TaskLayout,
+    state: Float[np.ndarray, "B S"],
+    alive: Bool[np.ndarray, "B N"],
+    blind: bool,
 ) -> Float[np.ndarray, "B N A"]:
     """Cover every point; watch hazardous ones from their edge."""
     position = layout.state.view(state, "position")
@@ -76,7 +82,11 @@ def _navigate(
 
 
 def _relay(
-    spec: TaskSpec, layout: TaskLayout, state: Float[np.ndarray, "B S"], alive: Bool[np.ndarray, "B N"], blind: bool
+    spec: TaskSpec,
+    layout: TaskLayout,
+    state: Float[np.ndarray, "B S"],
+    alive: Bool[np.ndarray, "B N"],
+    blind: bool,
 ) -> Float[np.ndarray, "B N A"]:
     """Form an evenly spaced chain between the terminals: straight if blind, else around the hazard."""
     position = layout.state.view(state, "position")
@@ -93,7 +103,10 @@ def _relay(
     return _fly(position, velocity, target)
 
 
-_PLANS: Mapping[str, Callable[..., Float[np.ndarray, "B N A"]]] = {"hazard_nav": _navigate, "hazard_comm": _relay}
+_PLANS: Mapping[str, Callable[..., Float[np.ndarray, "B N A"]]] = {
+    "hazard_nav": _navigate,
+    "hazard_comm": _relay,
+}
 
 
 def _fly(position: Places, velocity: Places, target: Places) -> Places:
@@ -138,7 +151,9 @@ def _around(position: Places, target: Places, hazard: Float[np.ndarray, "B P 3"]
         aim = np.where(blocked, centre + 1.15 * margin * closest / np.maximum(gap, 1e-9), aim)
         out = position - centre
         depth = np.linalg.norm(out, axis=-1, keepdims=True)
-        aim = np.where(depth < margin - 2 * _CLEARANCE, centre + 1.3 * margin * out / np.maximum(depth, 1e-9), aim)
+        aim = np.where(
+            depth < margin - 2 * _CLEARANCE, centre + 1.3 * margin * out / np.maximum(depth, 1e-9), aim
+        )
     return aim
 
 
