@@ -10,6 +10,7 @@ walkers fell, or at the horizon.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -71,8 +72,8 @@ class Snapshot:
 class MultiWalker:
     """Rules of multi-walker; see `hipg_bench.families.family.Family` for each method."""
 
-    causes = ("tipped", "sunk")
-    metrics = ("displacement", "slip", "carriers", "tipped", "sunk", "dropped")
+    causes: tuple[str, ...] = ("tipped", "sunk")
+    metrics: tuple[str, ...] = ("displacement", "slip", "carriers", "tipped", "sunk", "dropped")
     derived = False
 
     def __init__(self, spec: TaskSpec) -> None:
@@ -81,7 +82,7 @@ class MultiWalker:
         n = spec.num_agents
         self.body = body = walker_body.body_of(params.planar)
         self.physics_steps = max(1, round(spec.control_step / _PHYSICS_STEP))
-        self.fields = {"down": n, "displacement": 1, "slip": 1}
+        self.fields: Mapping[str, int] = {"down": n, "displacement": 1, "slip": 1}
         self.chance_size = walker_body.chance_size(body, n)
         self._seats = walker_body.seats(n, params.spacing)
         self._servos = 2 * int(body.servo.sum())

@@ -253,8 +253,8 @@ def _matrix(quaternion: Float[np.ndarray, "*lead 4"]) -> Float[np.ndarray, "*lea
 
 
 def sole_height(
-    body: Body, rotation: Float[np.ndarray, "*lead 3 3"], joint: Float[np.ndarray, "*lead 2 L"]
-) -> Float[np.ndarray, "*lead 2"]:
+    body: Body, rotation: Float[np.ndarray, "*#lead 3 3"], joint: Float[np.ndarray, "*#lead 2 L"]
+) -> Float[np.ndarray, "... 2"]:
     """Height of each foot's lowest point above the torso's origin, m.
 
     Args:
