@@ -146,10 +146,13 @@ def parse(kind: type[M], values: dict[str, Any], where: str) -> M:
     try:
         return kind(**values)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
+        # an unknown field first: where a name is misspelt, the right one is missing too
+        first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
         field = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise SpecError(f"{where}: no field {field!r}{hint(field, kind.model_fields)}") from error
+        if first["type"] == "missing":
+            raise SpecError(f"{where}: {field} is required and missing") from error
         raise SpecError(f"{where}: {field} = {first['input']!r} is refused: {first['msg']}") from error
 
 
@@ -159,7 +162,11 @@ def load(path: Path) -> TaskSpec:
     Raises:
         SpecError: the file does not hold a valid task, or its name is not the task's.
     """
-    spec = parse(TaskSpec, tomllib.loads(path.read_text()), str(path))
+    try:
+        values = tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise SpecError(f"{path}: not TOML: {error}") from error
+    spec = parse(TaskSpec, values, str(path))
     if spec.task != path.stem:
         raise SpecError(f"{path}: holds the task {spec.task!r}; a task file is named after its task")
     return spec

@@ -8,7 +8,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import jaxtyping
 
 # before hipg_bench is imported: every annotated shape and type of the package is checked in every test
-jaxtyping.install_import_hook("hipg_bench", "beartype.beartype")
+jaxtyping.install_import_hook("hipg_bench", "shape_checks.check")
 
 import pytest  # noqa: E402
 
