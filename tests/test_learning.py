@@ -1,0 +1,186 @@
+"""The learner's mathematics by hand, and runs that go on as if never stopped."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hipg_bench.errors import ResumeError, SpecError
+from hipg_bench.learning import credit
+from hipg_bench.learning.gae import gae
+from hipg_bench.learning.mappo import Trainer, surrogate
+from hipg_bench.learning.networks import RunningNorm
+from hipg_bench.learning.run import train
+from hipg_bench.learning.settings import recommended
+from hipg_bench.policies.network import load_network, save_network
+
+SMALL = {"num_envs": 8, "rollout": 10, "steps": 8 * 10 * 4, "actor_hidden": (16,), "critic_hidden": (16,)}
+
+
+def column(*values: float) -> torch.Tensor:
+    """One world's values over time, (T, 1)."""
+    return torch.tensor([float(value) for value in values])[:, None]
+
+
+def test_gae_by_hand() -> None:
+    # gamma = lam = 0.5; step 1 truncates, step 2 terminates
+    # delta0 = 1 + .5*2 - 1   = 1     next_value[0] = V(s1) = 2
+    # delta1 = 1 + .5*4 - 2   = 1     truncation bootstraps from the final state's V = 4
+    # delta2 = 1 + 0    - 3   = -2    termination does not
+    # A2 = -2; A1 = 1 (the sum is cut); A0 = 1 + .25 * A1 = 1.25
+    advantage = gae(
+        reward=column(1, 1, 1),
+        value=column(1, 2, 3),
+        next_value=column(2, 4, 100),
+        terminated=column(0, 0, 1).bool(),
+        done=column(0, 1, 1).bool(),
+        gamma=0.5,
+        lam=0.5,
+    )
+    torch.testing.assert_close(advantage, column(1.25, 1, -2))
+
+
+def test_gae_with_lambda_one_is_return_minus_value() -> None:
+    rng = torch.Generator().manual_seed(0)
+    reward, value = torch.randn(12, 3, generator=rng), torch.randn(12, 3, generator=rng)
+    last = torch.randn(3, generator=rng)
+    never = torch.zeros(12, 3, dtype=torch.bool)
+    got = gae(reward, value, torch.cat([value[1:], last[None]]), never, never, 0.9, 1.0)
+    # plain sum of discounted rewards plus the discounted last value
+    for b in range(3):
+        for t in range(12):
+            steps = [0.9 ** (k - t) * float(reward[k, b]) for k in range(t, 12)]
+            expected = sum(steps) + 0.9 ** (12 - t) * float(last[b]) - float(value[t, b])
+            assert float(got[t, b]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_min_health_credit_by_hand() -> None:
+    # eqn:min_health_baseline_ppo with V_targ = 10: h = 1 and V(s without 0) = 7 -> 3;
+    # h = 0.5 and V(s without 1) = 4 -> 0.5 * 6 = 3; h = 0 -> 0 whatever the critic says
+    psi = credit.min_health(
+        torch.tensor([10.0]), torch.tensor([[7.0, 4.0, -50.0]]), torch.tensor([[1.0, 0.5, 0.0]])
+    )
+    torch.testing.assert_close(psi, torch.tensor([[3.0, 3.0, 0.0]]))
+
+
+def test_central_credit_by_hand() -> None:
+    psi = credit.central(torch.tensor([10.0]), torch.tensor([8.0]), torch.tensor([[1.0, 0.0]]))
+    torch.testing.assert_close(psi, torch.tensor([[2.0, 0.0]]))
+
+
+@pytest.mark.parametrize("dead_value", [0.0, 1.0])
+def test_counterfactual_states_change_one_health_only(dead_value: float) -> None:
+    state = torch.arange(10.0)[None].repeat(2, 1)
+    columns = np.array([3, 7])
+    copies = credit.with_each_dead(state, columns, dead_value)
+    for agent, own in enumerate(columns.tolist()):
+        for name in range(10):
+            expected = dead_value if name == own else float(name)
+            assert (copies[:, agent, name] == expected).all()
+
+
+def test_normalisation_ignores_the_dead() -> None:
+    psi = torch.tensor([[1.0, 3.0], [1000.0, 5.0]])
+    live = torch.tensor([[True, True], [False, True]])
+    # live samples 1, 3, 5: mean 3, unbiased deviation 2
+    torch.testing.assert_close(credit.normalized(psi, live), torch.tensor([[-1.0, 0.0], [0.0, 1.0]]))
+
+
+def test_surrogate_by_hand() -> None:
+    # ratios 1.5, 1.5, 0.5, 0.5 with clip 0.2 and Psi 1, -1, 1, -1:
+    # min(1.5, 1.2) = 1.2; min(-1.5, -1.2) = -1.5; min(.5, .8) = .5; min(-.5, -.8) = -.8 -> mean -0.15
+    change = torch.tensor([1.5, 1.5, 0.5, 0.5]).log()
+    assert float(surrogate(change, torch.tensor([1.0, -1, 1, -1]), 0.2)) == pytest.approx(-0.15)
+
+
+def test_min_health_baseline_is_unbiased() -> None:
+    """Lemma 1: E[b(s without i) grad log pi] = 0, on states and actions of a real task."""
+    torch.manual_seed(0)
+    trainer = Trainer(recommended("hazard_nav-4", num_envs=64, rollout=20))
+    data = trainer.roll_out()
+    baseline = trainer._value_without_each(data).view_as(data.health)
+    mean = trainer.actor(data.observation).mean
+    # grad of log N(a; mu, sigma) with respect to mu is (a - mu) / sigma^2, sampled from the policy itself
+    score = (data.action - mean) / trainer.actor.log_std.exp() ** 2
+    sample = (data.health * baseline)[..., None] * score
+    # one sample per world and step: agents of one world share a state
+    per_step = sample.sum(dim=2).flatten(0, 1)
+    error = per_step.std(0) / len(per_step) ** 0.5
+    assert (per_step.mean(0).abs() < 4 * error).all()
+    # it can fail: the same baseline with actions that the policy did not choose is far from zero
+    biased = ((data.health * baseline)[..., None] * (score + 1)).sum(dim=2).flatten(0, 1)
+    assert (biased.mean(0).abs() > 4 * error).all()
+
+
+def test_a_dead_agents_sample_has_no_gradient() -> None:
+    """Lemma 2, with binary health."""
+    trainer = Trainer(recommended("hazard_nav-4", **SMALL))
+    data = trainer.roll_out()
+    data.health[:, :, 1] = 0.0
+    data.observation.requires_grad_(True)
+    _, psi = trainer._credit(data)
+    policy = trainer.actor(data.observation)
+    change = policy.log_prob(data.action).sum(-1) - data.log_prob
+    surrogate(change.flatten(), psi.flatten(), 0.2).backward()
+    assert (data.observation.grad[:, :, 1] == 0).all()
+    assert (data.observation.grad[:, :, 0] != 0).any()
+
+
+def test_running_norm_matches_all_data_at_once() -> None:
+    rng = np.random.default_rng(0)
+    parts = [rng.normal(5, 3, (n, 4)).astype(np.float32) for n in (50, 300, 7)]
+    norm = RunningNorm(4, fixed=np.array([2]))
+    for part in parts:
+        norm.update(torch.from_numpy(part))
+    together = np.concatenate(parts)
+    free = [0, 1, 3]
+    np.testing.assert_allclose(norm.offset.numpy()[free], together.mean(0)[free], atol=1e-3)
+    np.testing.assert_allclose(norm.scale.numpy()[free], together.std(0)[free], rtol=1e-3)
+    assert norm.offset[2] == 0
+    assert norm.scale[2] == 1
+
+
+def test_numpy_policy_is_the_torch_actor(tmp_path: Path) -> None:
+    trainer = Trainer(recommended("hazard_nav-4", **SMALL))
+    trainer.iterate()
+    save_network(trainer.actor.tensors(), tmp_path / "policy.safetensors")
+    policy = load_network(tmp_path / "policy.safetensors")
+    observation, alive = trainer.step.observation, trainer.step.info["alive"]
+    action, _ = policy.act(observation, None, alive)
+    expected = trainer.actor(torch.from_numpy(observation)).mean.detach().numpy().clip(-1, 1)
+    np.testing.assert_allclose(action, expected, atol=2e-5)
+
+
+def test_a_resumed_run_is_the_same_run(tmp_path: Path) -> None:
+    train(recommended("hazard_nav-4", **SMALL), tmp_path / "whole", command="test")
+    train(recommended("hazard_nav-4", **{**SMALL, "steps": 8 * 10 * 2}), tmp_path / "cut", command="test")
+    train(recommended("hazard_nav-4", **SMALL), tmp_path / "cut", command="test")
+    whole, cut = ((tmp_path / name / "policy.safetensors").read_bytes() for name in ("whole", "cut"))
+    assert whole == cut
+    rows = [list(csv.DictReader((tmp_path / name / "curve.csv").open())) for name in ("whole", "cut")]
+    assert len(rows[0]) == 4
+    for a, b in zip(*rows, strict=True):
+        assert {**a, "seconds": ""} == {**b, "seconds": ""}
+    assert json.loads((tmp_path / "cut" / "train.json").read_text())["env_steps"] == 320
+
+
+def test_another_runs_folder_is_refused(tmp_path: Path) -> None:
+    train(recommended("hazard_nav-4", **SMALL), tmp_path, command="test")
+    with pytest.raises(ResumeError, match="gamma"):
+        train(recommended("hazard_nav-4", **SMALL, gamma=0.5), tmp_path, command="test")
+
+
+@pytest.mark.parametrize(("field", "value"), [("gamma", 1.5), ("arm", "min-health"), ("steps", 0)])
+def test_settings_out_of_range_are_refused(field: str, value: object) -> None:
+    with pytest.raises(SpecError, match=field):
+        recommended("hazard_nav-4", **{field: value})
+
+
+def test_learning_pays_off_in_a_minute() -> None:
+    """PPO on a task without hazard: returns must rise well beyond the first iterations' noise."""
+    trainer = Trainer(recommended("coop_nav-3", num_envs=64, actor_hidden=(64,), critic_hidden=(64,)))
+    returns = [trainer.iterate()["return"] for _ in range(12)]
+    assert np.mean(returns[-2:]) > np.mean(returns[:2]) + 4
