@@ -112,7 +112,7 @@ class Agent:
         )
         if sizes != expected:
             raise BundleError(
-                f"agent {self.name!r}: {spec.task} has (O, A) = {expected}, its network has {sizes}; train it again"
+                f"agent {self.name!r}: {spec.task} has (O, A) = {expected}, its network {sizes}: train again"
             )
         return network
 

@@ -1,0 +1,41 @@
+"""The command line, and the only place that prints.
+
+Modules of this package import nothing heavy at their top, so that ``--help`` answers at once and
+``MUJOCO_GL`` can still be chosen.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+
+import typer
+
+from hipg_bench.cli import agents, bench, calibrate, evaluate, tasks
+from hipg_bench.errors import HipgError
+
+app = typer.Typer(
+    help="Teams that lose members: 3D tasks, trained teams, scores and films.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_show_locals=False,
+)
+app.command()(evaluate.evaluate)
+app.add_typer(tasks.app, name="tasks")
+app.add_typer(agents.app, name="agents")
+app.command()(calibrate.calibrate)
+app.command()(bench.bench)
+for _module, _names in {"train": ("train",), "media": ("video", "view"), "doctor": ("doctor",)}.items():
+    if importlib.util.find_spec(f"hipg_bench.cli.{_module}"):
+        for _name in _names:
+            app.command()(getattr(importlib.import_module(f"hipg_bench.cli.{_module}"), _name))
+
+
+def main() -> None:
+    """Run the command line; mistakes of the user's are told in one line, with exit code 2."""
+    try:
+        app()
+    except HipgError as error:
+        sys.stderr.write(f"hipg-bench: {error}\n")
+        sys.exit(2)

@@ -1,0 +1,75 @@
+"""``hipg-bench agents``: who can play."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+import typer
+
+from hipg_bench.cli import console
+
+app = typer.Typer(help="List the bundled agents; show one.", no_args_is_help=False)
+
+AsJson = Annotated[bool, typer.Option("--json", help="For scripts.")]
+
+
+@app.callback(invoke_without_command=True)
+def agents(context: typer.Context, as_json: AsJson = False) -> None:
+    """List the bundled agents; show one."""
+    if context.invoked_subcommand is not None:
+        return
+    from hipg_bench.policies import bundle
+
+    found = [bundle.load_agent(name) for name in bundle.agents()]
+    if as_json:
+        console.show_json([_facts(agent) for agent in found])
+        return
+    rows = console.table("agent", ">tasks", "")
+    for agent in found:
+        rows.add_row(agent.name, str(len(agent.tasks)), agent.summary)
+    console.show(rows)
+
+
+@app.command()
+def show(
+    agent: Annotated[str, typer.Argument(help="A bundled agent's name, or the path of a bundle.")],
+    as_json: AsJson = False,
+) -> None:
+    """Print what a bundle says of itself, and which tasks it plays."""
+    from hipg_bench.policies.bundle import load_agent
+
+    facts = _facts(load_agent(agent))
+    if as_json:
+        console.show_json(facts)
+        return
+    console.say(f"[bold]{facts['name']}[/bold]: {facts['summary']}")
+    console.out.print(facts["folder"], markup=False, soft_wrap=True)
+    for name in ("builtin", "kind", "authors", "license", "link"):
+        if facts[name]:
+            console.out.print(f"{name}: {facts[name]}", markup=False)
+    rows = console.table("\ntask", "\ntraining seeds", "\npolicy", "\ntrained by")
+    for task in facts["tasks"]:
+        seeds = ", ".join(str(seed) for seed in task["train_seeds"])
+        rows.add_row(task["task"], seeds, task["fingerprints"][0], task["command"])
+    console.show(rows)
+
+
+def _facts(agent: Any) -> dict[str, Any]:
+    """Everything about an agent, ready for JSON."""
+    tasks = [
+        {
+            "task": task,
+            "train_seeds": list(seeds),
+            "fingerprints": [agent.fingerprint(task, seed) for seed in seeds],
+            "command": _command(agent.folder / task / "train.json"),
+        }
+        for task in agent.tasks
+        if (seeds := agent.train_seeds(task))
+    ]
+    return agent.card.model_dump() | {"folder": str(agent.folder), "tasks": tasks}
+
+
+def _command(path: Any) -> str:
+    """The command that trained a policy, where the bundle tells it."""
+    return str(json.loads(path.read_text(encoding="utf-8")).get("command", "")) if path.is_file() else ""

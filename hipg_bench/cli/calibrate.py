@@ -1,0 +1,79 @@
+"""``hipg-bench calibrate``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hipg_bench.cli import console
+
+if TYPE_CHECKING:
+    from hipg_bench.evaluation.calibration import Calibration
+
+
+def calibrate(
+    task: Annotated[str, typer.Argument(help="The task's name.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Per measured policy.")] = 1000,
+    threads: Annotated[int, typer.Option(min=0, help="Physics threads, 0 for all cores.")] = 0,
+    write: Annotated[bool, typer.Option("--write", help="Freeze the numbers in the task file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+) -> None:
+    """Measure a task's anchors, its hazard leverage, and what policies without eyes score."""
+    from hipg_bench import registry
+    from hipg_bench.evaluation import calibration
+    from hipg_bench.paths import data_folder
+
+    spec = registry.task_spec(task)
+    with console.progress() as bars:
+        ids: dict[str, int] = {}
+
+        def progress(name: str, done: float) -> None:
+            if name not in ids:
+                ids[name] = bars.add_task(name, total=episodes)
+            bars.advance(bars.task_ids[ids[name]], done)
+
+        measured = calibration.calibrate(spec, episodes, threads=threads, progress=progress)
+    if write:
+        calibration.write(measured.spec, data_folder("tasks") / f"{task}.toml")
+    if as_json:
+        facts = measured.spec.model_dump(mode="json", include={"task", "version", "anchors", "calibration"})
+        console.show_json(facts | {"fingerprint": spec.fingerprint, "scores": dict(measured.scores)})
+    else:
+        _print(measured)
+
+
+def _print(measured: Calibration) -> None:
+    spec = measured.spec
+    anchors, facts = spec.anchors, spec.calibration
+    if anchors is None:
+        return
+    console.say(f"[bold]{spec.task}[/bold] v{spec.version} ({spec.fingerprint})\n")
+    rows = console.table("what", ">value", "95 %", "wanted", "")
+    for name, anchor in (("random", anchors.random), ("reference", anchors.reference)):
+        note = f"{anchor.episodes} episodes" if anchor.episodes else anchors.reference_is
+        rows.add_row(f"return, {name}", f"{anchor.mean:.2f}", console.interval(anchor.ci95), "", note)
+    for name, (score, ends) in measured.scores.items():
+        probe = name in ("zero", "constant", "time_only")
+        rows.add_row(
+            f"score, {name}",
+            f"{score:.3f}",
+            console.interval(ends, 3),
+            _wanted(score < 0.2, "< 0.2") if probe else "",
+        )
+    if "hazard_leverage" in facts:
+        leverage = facts["hazard_leverage"]
+        rows.add_row(
+            "hazard leverage",
+            f"{leverage:.3f}",
+            "",
+            _wanted(leverage >= 0.25, ">= 0.25"),
+            "score, hazard off - blind",
+        )
+        rows.add_row("deaths, blind", f"{facts['blind_deaths']:.3f}", "", "", "per agent and episode")
+    rows.add_row("deaths, random", f"{facts['random_deaths']:.3f}", "", "", "per agent and episode")
+    console.show(rows)
+
+
+def _wanted(met: bool, rule: str) -> str:
+    return f"[green]{rule}[/green]" if met else f"[red]{rule} MISSED[/red]"

@@ -1,0 +1,69 @@
+"""What all commands share: where to print, and how to show that something takes a while."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+out = Console(highlight=False)
+"""Results."""
+err = Console(stderr=True, highlight=False)
+"""Everything else."""
+
+
+def progress() -> Progress:
+    """A progress display with the time left; silent when nobody watches."""
+    return Progress(
+        TextColumn("{task.description:<18}"),
+        BarColumn(bar_width=None),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=err,
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
+
+
+def table(*columns: str, title: str | None = None) -> Table:
+    """A plain table; a column whose name starts with ``>`` is aligned to the right."""
+    made = Table(
+        title=title, title_justify="left", box=None, pad_edge=False, header_style="bold", padding=(0, 3, 0, 0)
+    )
+    for column in columns:
+        right = column.startswith(">")
+        made.add_column(column.lstrip(">"), justify="right" if right else "left", no_wrap=right)
+    return made
+
+
+def show(rows: Table) -> None:
+    """Print a table; wide enough for a pipe or file that has no width."""
+    if not sys.stdout.isatty():
+        out.width = max(out.width, 240)
+    out.print(rows)
+
+
+def say(text: str) -> None:
+    """Print a line with rich's markup; a pipe gets it unbroken."""
+    out.print(text, soft_wrap=not sys.stdout.isatty())
+
+
+def show_json(value: Any) -> None:
+    """Print JSON for a script."""
+    sys.stdout.write(json.dumps(value, indent=2) + "\n")
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number, or a dash where it is not defined."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def interval(ends: list[float] | tuple[float, float] | None, digits: int = 2) -> str:
+    """A 95 % interval in brackets (escaped: rich reads brackets as style)."""
+    return "" if ends is None else rf"\[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"

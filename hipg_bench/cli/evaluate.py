@@ -1,0 +1,112 @@
+"""``hipg-bench evaluate``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hipg_bench.cli import console
+
+if TYPE_CHECKING:
+    from hipg_bench.evaluation.runner import Suite
+
+_QUICK = 32
+
+
+def evaluate(
+    agent: Annotated[
+        str, typer.Option(help="A bundled agent's name, or the path of a bundle.")
+    ] = "mappo_minhealth",
+    tasks: Annotated[
+        str, typer.Option(help="Task names with commas between, or: standard, paper, all.")
+    ] = "standard",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and training seed.")] = 320,
+    seed: Annotated[int, typer.Option(min=0, help="Evaluation seed of the first 64 worlds.")] = 0,
+    num_envs: Annotated[
+        int, typer.Option(min=1, help="Worlds at a time, at most 64; no result depends on it.")
+    ] = 64,
+    threads: Annotated[
+        int, typer.Option(min=0, help="Physics threads, 0 for all cores; no result depends on it.")
+    ] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder; one of an interrupted run is resumed.")] = None,
+    video: Annotated[
+        int | None, typer.Option(min=0, help="Films per task; by default 1, with --quick 0.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A look: 32 episodes and no films, not for comparison.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
+) -> None:
+    """Score an agent on tasks, with films and a report."""
+    from hipg_bench.evaluation import runner
+    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.policies.bundle import load_agent
+
+    who, suite = load_agent(agent), suite_of(tasks)
+    plan = Plan(seed, _QUICK if quick else episodes, num_envs, threads)
+    films = (0 if quick else 1) if video is None else video
+    folder = out or Path("runs") / f"{who.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    seeds, _ = runner.playable(who, suite)
+    with console.progress() as bars:
+        totals = {task: plan.episodes * len(found) for task, found in seeds.items()}
+        if films:
+            totals["films"] = films * len(seeds)
+        ids = {name: bars.add_task(name, total=total) for name, total in totals.items()}
+        results = runner.evaluate(
+            who, suite, folder, plan, films_per_task=films,
+            progress=lambda stage, done: bars.advance(ids[stage], done),
+        )  # fmt: skip
+    if as_json:
+        console.show_json(results)
+    else:
+        _print(results, folder)
+
+
+def suite_of(tasks: str) -> Suite:
+    """The tasks named on the command line."""
+    from hipg_bench import registry
+    from hipg_bench.evaluation.runner import Suite
+
+    if tasks == "all":
+        return Suite("all", tuple(registry.tasks().values()))
+    if tasks in ("standard", "paper"):
+        names = registry.tagged(tasks)
+        return Suite(tasks, tuple(registry.task_spec(name) for name in names))
+    names = dict.fromkeys(name.strip() for name in tasks.split(",") if name.strip())
+    return Suite("custom", tuple(registry.task_spec(name) for name in names))
+
+
+def _print(results: dict[str, Any], folder: Path) -> None:
+    """The table at the end."""
+    number, interval = console.number, console.interval
+    rows = console.table("task", ">score", "", ">return", "", ">survival", ">deaths", "ended by")
+    for task in results["tasks"]:
+        rows.add_row(
+            task["task"], number(task["score"]), interval(task["score_ci95"]),
+            number(task["return_mean"], 1), interval(task["return_ci95"], 1),
+            f"{100 * task['survival']:.0f} %", number(task["deaths"]),
+            ", ".join(f"{reason} {count}" for reason, count in task["end_reasons"].items()),
+        )  # fmt: skip
+    for task in results["skipped"]:
+        rows.add_row(task["task"], "-", f"[dim]{task['reason']}[/dim]")
+    console.say(f"[bold]{results['agent']}[/bold] on {results['suite']}: {results['agent_summary']}\n")
+    console.show(rows)
+    whole = results["aggregate"]
+    if whole["score_iqm"] is not None:
+        zero = (
+            f", {whole['counted_as_zero']} of them unplayed and counted as 0"
+            if whole["counted_as_zero"]
+            else ""
+        )
+        console.say(
+            f"\nscore, interquartile mean over {whole['tasks']} tasks{zero}: "
+            f"[bold]{number(whole['score_iqm'])}[/bold] {interval(whole['score_iqm_ci95'])}"
+        )
+    if results["episodes_per_policy"] < 320:
+        console.say(f"[dim]{results['episodes_per_policy']} episodes per policy: not for comparison[/dim]")
+    for trouble in results["film_trouble"]:
+        console.err.print(f"no film: {trouble}", markup=False)
+    console.out.print(f"\n{folder / 'report.html'}", markup=False, soft_wrap=True)

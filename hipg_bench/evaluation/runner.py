@@ -1,0 +1,203 @@
+"""`evaluate`: an agent plays a suite; rows, results, films and a report come to lie in one folder.
+
+    run.json                 what the folder belongs to
+    episodes/<task>.jsonl    one row per episode: the product, byte for byte reproducible
+    films/<task>.npz         state rows of the filmed episodes
+    videos/<task>.mp4        the median episode
+    results.json             everything computed from the rows
+    report.html              the same to look at
+
+An interrupted evaluation goes on where it stopped, and ends with the same rows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hipg_bench.errors import BundleError, ResumeError
+from hipg_bench.evaluation import films, report
+from hipg_bench.evaluation.episodes import Plan, Row, versions
+from hipg_bench.evaluation.results import SCHEMA, aggregate, summarise
+from hipg_bench.paths import write_text
+from hipg_bench.policies.bundle import Agent
+from hipg_bench.spec import TaskSpec
+
+Progress = Callable[[str, float], None]
+"""Told a task (or ``films``) and how many more of its episodes (or films) are done."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Suite:
+    """The tasks to play, and what to call the lot."""
+
+    name: str
+    specs: tuple[TaskSpec, ...]
+
+
+def quiet(stage: str, done: float) -> None:
+    """Tell nobody."""
+
+
+def playable(agent: Agent, suite: Suite) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
+    """Training seeds per task that the agent plays, and the reason per task that it does not.
+
+    Raises:
+        BundleError: it plays none of them.
+    """
+    seeds: dict[str, tuple[int, ...]] = {}
+    skipped: dict[str, str] = {}
+    for spec in suite.specs:
+        found = agent.train_seeds(spec.task)
+        if not found and agent.card.kind == "network":
+            skipped[spec.task] = "no weights for this task"
+            continue
+        try:
+            for train_seed in found or (0,):
+                agent.policy(spec, train_seed)
+            seeds[spec.task] = found
+        except BundleError as error:
+            skipped[spec.task] = str(error)
+    if not seeds:
+        raise BundleError(
+            f"agent {agent.name!r} plays none of these tasks:\n"
+            + "\n".join(f"  {task}: {reason}" for task, reason in skipped.items())
+        )
+    return seeds, skipped
+
+
+def evaluate(
+    agent: Agent, suite: Suite, out: Path, plan: Plan, *, films_per_task: int = 0, progress: Progress = quiet
+) -> dict[str, Any]:
+    """Score an agent.
+
+    Args:
+        agent: who plays.
+        suite: what.
+        out: folder, new or of the same evaluation interrupted earlier.
+        plan: which worlds.
+        films_per_task: how many episodes are filmed; the first is the median one.
+        progress: told how far it is.
+
+    Returns:
+        What ``results.json`` holds.
+
+    Raises:
+        BundleError: the agent plays none of the tasks.
+        ResumeError: ``out`` belongs to another evaluation.
+    """
+    seeds, skipped = playable(agent, suite)
+    _claim(out, {"agent": agent.name, "seed": plan.seed, "versions": versions()})
+    rows: dict[str, list[Row]] = {}
+    timing: dict[str, dict[str, float]] = {}
+    for spec in suite.specs:
+        if spec.task in seeds:
+            started = time.perf_counter()
+            rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, progress)
+            timing[spec.task] = {"seconds": round(time.perf_counter() - started, 3)}
+    played = [spec for spec in suite.specs if spec.task in rows]
+    made, trouble = [], []
+    if films_per_task:
+        started = time.perf_counter()
+        jobs = [
+            job
+            for spec in played
+            for job in films.choose(agent, spec, rows[spec.task], plan, films_per_task, out)
+        ]
+        made, trouble = films.make(jobs, lambda done: progress("films", done))
+        timing["films"] = {"seconds": round(time.perf_counter() - started, 3)}
+    results = {
+        "schema": SCHEMA,
+        "suite": suite.name,
+        "agent": agent.name,
+        "agent_summary": agent.summary,
+        "seed": plan.seed,
+        "episodes_per_policy": plan.episodes,
+        "versions": versions(),
+        "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in suite.specs]),
+        "tasks": [summarise(spec, rows[spec.task]) for spec in played],
+        "skipped": [{"task": task, "reason": reason} for task, reason in skipped.items()],
+        "films": [{"task": job.task, "file": job.file, "title": job.title} for job in made],
+        "film_trouble": trouble,
+        "timing": timing,
+    }
+    write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
+    write_text(out / "report.html", report.render(results, rows, {spec.task: spec for spec in played}))
+    return results
+
+
+def _play_task(
+    agent: Agent, spec: TaskSpec, train_seeds: Sequence[int], out: Path, plan: Plan, progress: Progress
+) -> list[Row]:
+    """Play what is missing of one task; the file is whole after every batch."""
+    path = out / "episodes" / f"{spec.task}.jsonl"
+    identity = {
+        k: {
+            "task": spec.task, "version": spec.version, "fingerprint": spec.fingerprint, "agent": agent.name,
+            "policy": agent.fingerprint(spec.task, k), "train_seed": k, "versions": versions(),
+        }
+        for k in train_seeds
+    }  # fmt: skip
+    rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, identity, plan)}
+    progress(spec.task, len(rows))
+    for train_seed in train_seeds:
+        policy = agent.policy(spec, train_seed)
+        done = [world for seed, world in rows if seed == train_seed]
+        for worlds in plan.batches(done):
+            played = plan.play(spec, policy, worlds, lambda more: progress(spec.task, more))
+            rows |= {(train_seed, row["world"]): identity[train_seed] | row for row in played}
+            _write_rows(path, rows)
+    return [rows[key] for key in sorted(rows)]
+
+
+def _write_rows(path: Path, rows: Mapping[tuple[int, int], Row]) -> None:
+    write_text(path, "".join(json.dumps(rows[key], allow_nan=False) + "\n" for key in sorted(rows)))
+
+
+def _resumed(path: Path, identity: Mapping[int, Row], plan: Plan) -> list[Row]:
+    """Rows of an earlier, interrupted call.
+
+    Raises:
+        ResumeError: they are another agent's, task's or plan's.
+    """
+    if not path.exists():
+        return []
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    for row in rows:
+        expected = identity.get(row["train_seed"])
+        if expected is None:
+            raise _foreign(path, "train_seed", row["train_seed"], list(identity))
+        expected = expected | {"eval_seed": plan.eval_seed(row["world"])}
+        for name, value in expected.items():
+            if row[name] != value:
+                raise _foreign(path, name, row[name], value)
+        if row["world"] >= plan.episodes:
+            raise _foreign(path, "world", row["world"], f"below {plan.episodes}")
+    return rows
+
+
+def _claim(out: Path, run: dict[str, Any]) -> None:
+    """Say whom the folder belongs to, or see that it is ours.
+
+    Raises:
+        ResumeError: it belongs to another evaluation.
+    """
+    path = out / "run.json"
+    if path.exists():
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        for name, value in run.items():
+            if earlier.get(name) != value:
+                raise _foreign(path, name, earlier.get(name), value)
+    else:
+        write_text(path, json.dumps(run, indent=2) + "\n")
+
+
+def _foreign(path: Path, name: str, got: object, expected: object) -> ResumeError:
+    return ResumeError(
+        f"{path} belongs to another evaluation: {name} is {got!r} there and {expected!r} here; "
+        f"choose another --out"
+    )
