@@ -13,6 +13,8 @@ from hipg_bench.families.family import Family
 from hipg_bench.families.hazard_comm import HazardComm
 from hipg_bench.families.hazard_nav import HazardNav
 from hipg_bench.families.multiwalker import MultiWalker
+from hipg_bench.families.paper_comm import PaperComm
+from hipg_bench.families.paper_nav import PaperNav
 from hipg_bench.paths import data_folder
 from hipg_bench.spec import TaskSpec
 
@@ -20,6 +22,8 @@ FAMILIES: Mapping[str, Callable[[TaskSpec], Family]] = {
     "hazard_nav": HazardNav,
     "hazard_comm": HazardComm,
     "multiwalker": MultiWalker,
+    "paper_nav": PaperNav,
+    "paper_comm": PaperComm,
 }
 """Name in a task file to the class with its rules."""
 
