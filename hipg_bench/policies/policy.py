@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 
+@runtime_checkable
 class Policy(Protocol):
     """A pure object: what it remembers between steps travels through ``memory``.
 
