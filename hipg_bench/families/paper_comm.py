@@ -20,8 +20,8 @@ from hipg_bench.families import paper_particles as particles
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import coverage, radio
-from hipg_bench.mechanics.pairs import Pairs, of_both, pairs, table
+from hipg_bench.mechanics import radio
+from hipg_bench.mechanics.pairs import Gaps, between_agents, of_both, table, to_points
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -55,9 +55,9 @@ class Snapshot:
     velocity: Float[np.ndarray, "B N 2"]  # m/s; of the dead, the one they died with
     health: Float[np.ndarray, "B N"]
     marker: Float[np.ndarray, "B 3 2"]  # the two terminals, the hazard, m
-    distance: Float[np.ndarray, "B 3 N"]  # from them to agents, m
     connected: Bool[np.ndarray, "B"]  # at the end of the last step
-    apart: Pairs
+    away: Gaps  # agents to terminals and hazard
+    apart: Gaps  # agents to agents
     past: particles.Past | None  # with the histogram observation
     look: Float[np.ndarray, "B N K"] | None = None  # this step's part of the histogram observation
     past_look: Float[np.ndarray, "B N K"] | None = None  # the previous step's; both counted once only
@@ -80,7 +80,6 @@ class PaperComm:
             "connected": 1, "connected_steps": 1, "collisions": 1, **particles.memory(params, n),
         }  # fmt: skip
         self.chance_size = 2 + 2 * n
-        self._others = particles.others(n)
         terminals = Block("terminal_position", (2, 2), "m", "world")
         self._look_layout = Layout((*particles.own_blocks(), terminals, *particles.around_blocks()))
         self.layout = TaskLayout(
@@ -132,15 +131,16 @@ class PaperComm:
             velocity=velocity,
             health=sim.field["health"][rows].copy(),
             marker=marker,
-            distance=coverage.distances(marker, position),
             connected=sim.field["connected"][rows, 0] > 0,
-            apart=pairs(position),
+            away=to_points(position, marker),
+            apart=between_agents(position),
             past=None if self._direct else particles.past(sim, n, rows),
         )
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from the hazard, and from every contact."""
-        burn = particles.burn(self.params, now.distance[:, _HAZARD:], self.spec.control_step)
+        hazardous = np.ones((1, len(now.health)), bool)
+        burn = particles.burn(self.params, now.away.distance[_HAZARD:], hazardous, self.spec.control_step)
         return particles.harm(self.params, burn, self._touching(now), was.health > 0)
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
@@ -191,7 +191,7 @@ class PaperComm:
     def measure(
         self, sim: Sim, ids: Int[np.ndarray, "n"], now: Snapshot
     ) -> dict[str, Float[np.ndarray, "n"]]:
-        """``connected``: share of steps with a chain; ``collisions``: live pairs in contact, over all steps."""
+        """``connected``: share of steps with a chain; ``collisions``: contacts of live pairs, all steps."""
         return {
             "connected": sim.field["connected_steps"][ids, 0] / sim.field["elapsed"][ids, 0],
             "collisions": sim.field["collisions"][ids, 0],
@@ -214,8 +214,7 @@ class PaperComm:
 
     def _list(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """The direct observation: what the others within range say."""
-        agents = np.arange(self.spec.num_agents)[:, None]
-        heard = np.moveaxis(self._links(now), -1, 0)[:, agents, self._others][..., None]
+        heard = particles.others(np.ascontiguousarray(np.moveaxis(self._links(now), -1, 0)))
         return self.layout.observation.pack(
             {
                 "terminated": (now.health == 0)[..., None],
@@ -223,8 +222,8 @@ class PaperComm:
                 "position": now.position,
                 "terminal_position": now.marker[:, None, :_HAZARD],
                 "other_terminated": np.zeros(1),
-                "other_position": np.where(heard, particles.relative(now.position, self._others), 0.0),
-                "other_velocity": np.where(heard, particles.relative(now.velocity, self._others), 0.0),
+                "other_position": particles.relative(now.position, heard),
+                "other_velocity": particles.relative(now.velocity, heard),
             },
             now.health.shape,
         )
@@ -254,7 +253,7 @@ class PaperComm:
             position=past.position,
             velocity=past.velocity,
             health=past.health,
-            apart=pairs(past.position),
+            apart=between_agents(past.position),
         )
         return np.where(past.exists[:, None, None], self._look(before), np.float32(0))
 
@@ -269,9 +268,9 @@ class PaperComm:
     def _connected(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
         """Whether live agents link the terminals; terminals do not hear each other."""
         n = self.spec.num_agents
-        heard = (now.distance[:, :_HAZARD] <= self.link_range) & (now.health > 0)[:, None]
+        heard = (now.away.distance[:_HAZARD] <= self.link_range) & (now.health.T > 0)
         links = np.zeros((n + 2, n + 2, len(now.health)), bool)
         links[2:, 2:] = self._links(now)
-        links[:2, 2:] = heard.transpose(1, 2, 0)
-        links[2:, :2] = heard.transpose(2, 1, 0)
+        links[:2, 2:] = heard
+        links[2:, :2] = heard.transpose(1, 0, 2)
         return radio.reachable(np.moveaxis(links, -1, 0), 0)[:, 1]

@@ -20,8 +20,7 @@ from hipg_bench.families import paper_particles as particles
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import coverage
-from hipg_bench.mechanics.pairs import Pairs, of_both, pairs
+from hipg_bench.mechanics.pairs import Gaps, between_agents, of_both, to_points
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -52,8 +51,8 @@ class Snapshot:
     point: Float[np.ndarray, "B L 2"]  # m
     hazardous: Bool[np.ndarray, "B L"]
     revealed: Bool[np.ndarray, "B L"]  # hazardous, and known to be
-    distance: Float[np.ndarray, "B L N"]  # landmark to agent, m
-    apart: Pairs
+    away: Gaps  # agents to landmarks
+    apart: Gaps  # agents to agents
     past: particles.Past | None  # with the histogram observation
     past_revealed: Bool[np.ndarray, "B L"]
     look: Float[np.ndarray, "B N K"] | None = None  # this step's part of the histogram observation
@@ -79,10 +78,9 @@ class PaperNav:
             **particles.memory(params, n),
         }  # fmt: skip
         self.chance_size = 2 * n + 3 * points
-        self._others = particles.others(n)
         self._look_layout = Layout((
             *particles.own_blocks(),
-            Block("point_count", particles.CELLS, "landmarks", "own", f"{particles.IN_RANGE}, unless revealed"),
+            Block("point_count", particles.CELLS, "landmarks", "own", f"{particles.IN_RANGE}, unrevealed"),
             Block("hazard_position", (2,), "m", "own", "nearest revealed hazard, at any distance"),
             *particles.around_blocks(),
         ))  # fmt: skip
@@ -133,16 +131,15 @@ class PaperNav:
             point=point,
             hazardous=sim.field["hazardous"][rows] > 0,
             revealed=sim.field["revealed"][rows] > 0,
-            distance=coverage.distances(point, position),
-            apart=pairs(position),
+            away=to_points(position, point),
+            apart=between_agents(position),
             past=None if self._direct else particles.past(sim, n, rows),
             past_revealed=sim.field["past_revealed"][rows] > 0,
         )
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from every hazardous landmark within reach, and from contacts where the spec says so."""
-        distance = np.where(now.hazardous[:, :, None], now.distance, np.inf)
-        burn = particles.burn(self.params, distance, self.spec.control_step)
+        burn = particles.burn(self.params, now.away.distance, now.hazardous.T, self.spec.control_step)
         return particles.harm(self.params, burn, particles.touching(now.apart, self.radius), was.health > 0)
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
@@ -223,7 +220,8 @@ class PaperNav:
     def _list(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """The direct observation."""
         dead = now.health == 0
-        hidden = dead[:, self._others][..., None]
+        n = self.spec.num_agents
+        gone = particles.others(np.broadcast_to(dead[:, None], (len(dead), n, n)))
         return self.layout.observation.pack(
             {
                 "terminated": dead[..., None],
@@ -231,9 +229,9 @@ class PaperNav:
                 "position": now.position,
                 "point_position": now.point[:, None] - now.position[:, :, None],
                 "point_revealed": now.revealed[:, None],
-                "other_terminated": dead[:, self._others],
-                "other_position": np.where(hidden, 0.0, particles.relative(now.position, self._others)),
-                "other_velocity": np.where(hidden, 0.0, particles.relative(now.velocity, self._others)),
+                "other_terminated": gone,
+                "other_position": particles.relative(now.position, ~gone),
+                "other_velocity": particles.relative(now.velocity, ~gone),
             },
             now.health.shape,
         )
@@ -246,7 +244,7 @@ class PaperNav:
                 "terminated": dead[..., None],
                 "velocity": now.velocity,
                 "position": now.position,
-                "point_count": particles.points_around(now.position, now.point, ~now.revealed),
+                "point_count": particles.points_around(now.away, ~now.revealed.T),
                 "hazard_position": self._nearest_revealed(now),
                 "other_count": particles.agents_around(now.apart, ~dead),
                 "dead_position": particles.nearest_dead(now.position, dead),
@@ -265,8 +263,8 @@ class PaperNav:
             velocity=past.velocity,
             health=past.health,
             revealed=now.past_revealed,
-            distance=coverage.distances(now.point, past.position),
-            apart=pairs(past.position),
+            away=to_points(past.position, now.point),
+            apart=between_agents(past.position),
         )
         return np.where(past.exists[:, None, None], self._look(before), np.float32(0))
 
@@ -274,22 +272,22 @@ class PaperNav:
         """Relative position of the nearest revealed hazard, m; zeros before one is known."""
         found = np.zeros_like(now.position)
         ids = np.flatnonzero(now.revealed.any(axis=1))
-        distance = np.where(now.revealed[ids, :, None], now.distance[ids], np.inf)
-        found[ids] = now.point[ids[:, None], distance.argmin(axis=1)] - now.position[ids]
+        distance = np.where(now.revealed[ids].T[:, None], now.away.distance[..., ids], np.inf)
+        found[ids] = now.point[ids[:, None], distance.argmin(axis=0).T] - now.position[ids]
         return found
 
     def _found(self, now: Snapshot) -> Bool[np.ndarray, "n L"]:
         """Hazards with an agent, dead or alive, within their radius."""
-        return now.hazardous & (now.distance < self.params.hazard_radius).any(axis=2)
+        return now.hazardous & (now.away.distance < self.params.hazard_radius).any(axis=1).T
 
     def _gap(self, now: Snapshot) -> Float[np.ndarray, "B"]:
         """Sum over safe landmarks of the distance to the nearest agent that covers, m."""
-        distance = now.distance
+        distance = now.away.distance
         if not self.params.dead_cover:
-            distance = np.where((now.health > 0)[:, None, :], distance, np.inf)
-        nearest = distance.min(axis=-1)
+            distance = np.where(now.health.T > 0, distance, np.inf)
+        nearest = distance.min(axis=1)
         nearest = np.where(np.isinf(nearest), self.params.nobody, nearest)
-        return np.where(now.hazardous, 0.0, nearest).sum(axis=-1)
+        return np.where(now.hazardous.T, 0.0, nearest).sum(axis=0)
 
     def _overlaps(self, now: Snapshot) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
         """Overlapping pairs of which both live, and of which one does."""

@@ -13,14 +13,14 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 import mujoco
 import numpy as np
 import pydantic
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from hipg_bench.families.family import Harm, Rows
 from hipg_bench.families.scene import asset, attach
 from hipg_bench.layout import Block, Layout
-from hipg_bench.mechanics import coverage, hazards, histogram, sensing
+from hipg_bench.mechanics import hazards, histogram
 from hipg_bench.mechanics import health as health_law
-from hipg_bench.mechanics.pairs import Pairs, members, of_both, pairs, repulsion
+from hipg_bench.mechanics.pairs import Gaps, between_agents, members, of_both, repulsion
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params, TaskSpec
 
@@ -133,7 +133,7 @@ def act(sim: Sim, params: ParticleParams, radius: float, action: Float[np.ndarra
     alive = sim.field["health"] > 0
     np.copyto(sim.velocity, 0.0, where=np.repeat(~alive, 2, axis=1))
     sim.control[:] = action.reshape(len(action), -1)
-    apart = pairs(sim.position.reshape(action.shape))
+    apart = between_agents(sim.position.reshape(action.shape))
     push = repulsion(apart, alive, 2 * radius, params.contact_stiffness, params.contact_margin)
     sim.applied[:] = _factor(params) * push.reshape(len(action), -1)
 
@@ -169,7 +169,7 @@ def remember(sim: Sim, was: Body, now: Body, *, past: bool) -> None:
         field["past_health"][:] = was.health
 
 
-def touching(apart: Pairs, radius: float) -> Bool[np.ndarray, "P B"]:
+def touching(apart: Gaps, radius: float) -> Bool[np.ndarray, "P B"]:
     """Pairs that overlap, dead or alive."""
     return apart.distance < 2 * radius
 
@@ -188,25 +188,29 @@ def harm(
         touch: pairs that overlap.
         alive: before this step.
     """
-    one, other = of_both(alive)
+    which, world = np.nonzero(touch)
+    one, other = (agents[which] for agents in members(alive.shape[1]))
     crash = np.zeros_like(burn)
-    which, world = np.nonzero(touch & one & other)
-    for agents in members(alive.shape[1]):
-        np.add.at(crash, (world, agents[which]), -np.log1p(-params.collision_risk))
+    risk = np.where(alive[world, one] & alive[world, other], -np.log1p(-params.collision_risk), 0.0)
+    np.add.at(crash, (world, one), risk)
+    np.add.at(crash, (world, other), risk)
     cause = np.where(crash > burn, _COLLISION, _HAZARD)
     return Harm(burn + crash, fatal=np.zeros_like(alive), cause=cause)
 
 
 def burn(
-    params: ParticleParams, distance: Float[np.ndarray, "B H N"], control_step: float
+    params: ParticleParams,
+    distance: Float[np.ndarray, "L N B"],
+    hazardous: Bool[np.ndarray, "L B"],
+    control_step: float,
 ) -> Float[np.ndarray, "B N"]:
-    """Exposure from hazards at the given distances (infinite: no hazard), nats."""
-    risk = hazards.risk(distance, params.hazard_radius, params.hazard_peak)
-    exposure = np.zeros_like(risk)
-    # few agents are near a hazard: logarithms only for them
-    near = risk > 0
-    exposure[near] = health_law.hazard_rate(risk[near], control_step / 0.1)
-    return exposure.sum(axis=1)
+    """Exposure of each agent from the points that are hazardous, nats."""
+    exposure = np.zeros((distance.shape[2], distance.shape[1]))
+    # few agents are near a hazard: the law is worked out only for them
+    point, agent, world = np.nonzero((distance < params.hazard_radius) & hazardous[:, None])
+    risk = hazards.risk(distance[point, agent, world], params.hazard_radius, params.hazard_peak)
+    np.add.at(exposure, (world, agent), health_law.hazard_rate(risk, control_step / 0.1))
+    return exposure
 
 
 def deaths_by_cause(sim: Sim, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "n"]]:
@@ -217,7 +221,7 @@ def deaths_by_cause(sim: Sim, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.n
     }
 
 
-def agents_around(apart: Pairs, alive: Bool[np.ndarray, "B N"]) -> Int[np.ndarray, "B N 4 8"]:
+def agents_around(apart: Gaps, alive: Bool[np.ndarray, "B N"]) -> Int[np.ndarray, "B N 4 8"]:
     """Histogram of the other live agents around each agent."""
     first, second = members(alive.shape[1])
     one, other = of_both(alive)
@@ -230,33 +234,32 @@ def agents_around(apart: Pairs, alive: Bool[np.ndarray, "B N"]) -> Int[np.ndarra
     )
 
 
-def points_around(
-    position: Float[np.ndarray, "B N 2"], point: Float[np.ndarray, "B L 2"], counted: Bool[np.ndarray, "B L"]
-) -> Int[np.ndarray, "B N 4 8"]:
+def points_around(away: Gaps, counted: Bool[np.ndarray, "L B"]) -> Int[np.ndarray, "B N 4 8"]:
     """Histogram of the points that count around each agent."""
-    agents, points = position.shape[1], point.shape[1]
-    observer, thing = np.repeat(np.arange(agents), points), np.tile(np.arange(points), agents)
-    seen, seer = (
-        np.ascontiguousarray(point.transpose(2, 1, 0)),
-        np.ascontiguousarray(position.transpose(2, 1, 0)),
-    )
-    gap = seen[:, thing] - seer[:, observer]
-    cell = histogram.cells(gap, np.sqrt(gap[0] * gap[0] + gap[1] * gap[1]))
-    return histogram.tally(cell, np.ascontiguousarray(counted.T)[thing], observer, agents)
+    points, agents, worlds = away.distance.shape
+    cell = histogram.cells(away.gap, away.distance).reshape(-1, worlds)
+    observer = np.tile(np.arange(agents), points)
+    return histogram.tally(cell, np.repeat(counted, agents, axis=0), observer, agents)
 
 
 def nearest_dead(
     position: Float[np.ndarray, "B N 2"], dead: Bool[np.ndarray, "B N"]
 ) -> Float[np.ndarray, "B N 5 2"]:
-    """Where the nearest dead agents lie relative to each agent, m, at any distance; zeros where there are fewer."""
+    """Where the nearest other dead agents lie relative to each agent, m, at any distance; zeros beyond."""
     found = np.zeros((*dead.shape, LISTED, 2))
     ids = np.flatnonzero(dead.any(axis=1))
-    if len(ids):
-        where, slots = position[ids], min(LISTED, dead.shape[1])
-        visible = dead[ids][:, None, :] & ~np.eye(dead.shape[1], dtype=bool)
-        sensed = sensing.nearest_within(coverage.distances(where, where), visible, np.inf, slots)
-        gap = sensing.gather(where, sensed) - where[:, :, None]
-        found[ids, :, :slots] = np.where(sensed.seen[..., None], gap, 0.0)
+    if not len(ids):
+        return found
+    # only as many columns as the worst world has dead
+    place, dead = _complex(position[ids]), dead[ids]
+    which = np.argsort(~dead, axis=1, stable=True)[:, : dead.sum(axis=1).max()]
+    gap = np.take_along_axis(place, which, axis=1)[:, None] - place[:, :, None]
+    agents = np.arange(dead.shape[1])[:, None]
+    counts = np.take_along_axis(dead, which, axis=1)[:, None] & (which[:, None] != agents)
+    squared = np.where(counts, np.real(gap) ** 2 + np.imag(gap) ** 2, np.inf)
+    order = np.argsort(squared, axis=-1, stable=True)[..., :LISTED]
+    nearest = np.take_along_axis(np.where(counts, gap, 0.0), order, axis=-1)
+    found[ids, :, : order.shape[-1]] = nearest.view(np.float64).reshape(*nearest.shape, 2)
     return found
 
 
@@ -286,15 +289,26 @@ def two_steps(look: Layout) -> Layout:
     return Layout((*look.blocks, *before))
 
 
-def others(num_agents: int) -> Int[np.ndarray, "N N-1"]:
-    """Row i: all agents but i, in order."""
-    index = np.arange(num_agents)
-    return np.stack([np.delete(index, i) for i in index])
+def others(table: Shaped[np.ndarray, "*B N N"]) -> Shaped[np.ndarray, "*B N N-1"]:
+    """Drop each agent's entry about itself."""
+    n = table.shape[-1]
+    # behind the first entry, every (N + 1)th lies on the diagonal
+    rows = table.reshape(-1, n * n)[:, 1:].reshape(-1, n - 1, n + 1)[..., :-1]
+    return rows.reshape(*table.shape[:-1], n - 1)
 
 
-def relative(of: Float[np.ndarray, "B N 2"], others: Int[np.ndarray, "N M"]) -> Float[np.ndarray, "B N M 2"]:
-    """Of each agent's others, relative to that agent."""
-    return of[:, others] - of[:, :, None]
+def relative(
+    of: Float[np.ndarray, "B N 2"], shown: Bool[np.ndarray, "B N N-1"]
+) -> Float[np.ndarray, "B N N-1 2"]:
+    """A quantity of every other agent, in their order, less the observer's own; zeros where not shown."""
+    vector = _complex(of)
+    gap = np.where(shown, others(vector[:, None] - vector[:, :, None]), 0.0)
+    return gap.view(np.float64).reshape(*gap.shape, 2)
+
+
+def _complex(vector: Float[np.ndarray, "B N 2"]) -> Complex[np.ndarray, "B N"]:
+    """Vectors of the plane as one number each, so that axes of two do not slow NumPy down."""
+    return np.ascontiguousarray(vector).view(np.complex128)[..., 0]
 
 
 def _factor(params: ParticleParams) -> float:

@@ -18,7 +18,7 @@ _BEYOND = RINGS * SECTORS
 """First cell of those out of range."""
 _CELLS = _BEYOND + SECTORS
 _HALF_SECTOR = np.tan(np.pi / 8)
-# by two bits for "nearly along x", "nearly along y" and two for the signs of x and y: 8 y-ish, 4 x-ish, 2 y<0, 1 x<0
+# by four bits: 8 nearly along y, 4 nearly along x, 2 y < 0, 1 x < 0
 _SECTOR = np.array([1, 3, 7, 5, 0, 4, 0, 4, 2, 2, 6, 6, 0, 4, 0, 4], np.uint8)
 
 
@@ -61,8 +61,8 @@ def tally(
         num_agents: N.
     """
     worlds = cell.shape[1]
-    start = np.arange(worlds) * num_agents + observer[:, None]
-    index = start * _CELLS + np.where(counted, cell, np.uint8(_BEYOND))
+    first = (np.arange(worlds) * num_agents + observer[:, None]) * _CELLS
+    index = first + np.where(counted, cell, np.uint8(_BEYOND))
     count = np.bincount(index.ravel(), minlength=worlds * num_agents * _CELLS)
     return count.reshape(worlds, num_agents, _CELLS)[..., :_BEYOND].reshape(
         worlds, num_agents, RINGS, SECTORS
