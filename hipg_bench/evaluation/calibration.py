@@ -90,6 +90,8 @@ def calibrate(spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Prog
         blind = lab.play("blind", Scripted(spec, blind=True))
         scores |= {"hazard off": _score(scale, safe), "blind": _score(scale, blind)}
         facts["blind_deaths"] = float(np.mean([row["deaths"] for row in blind])) / spec.num_agents
+        facts["score_blind"] = scores["blind"][0]
+        facts["score_hazard_off"] = scores["hazard off"][0]
         facts["hazard_leverage"] = scores["hazard off"][0] - scores["blind"][0]
     rounded = {name: round(value, 4) for name, value in facts.items()}
     return Calibration(scale.model_copy(update={"calibration": rounded}), scores)

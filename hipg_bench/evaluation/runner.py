@@ -53,11 +53,11 @@ def playable(agent: Agent, suite: Suite) -> tuple[dict[str, tuple[int, ...]], di
     skipped: dict[str, str] = {}
     for spec in suite.specs:
         found = agent.train_seeds(spec.task)
-        if not found and agent.card.kind == "network":
-            skipped[spec.task] = "no weights for this task"
+        if not found:
+            skipped[spec.task] = f"no {'weights' if agent.card.kind == 'network' else 'policy'} for this task"
             continue
         try:
-            for train_seed in found or (0,):
+            for train_seed in found:
                 agent.policy(spec, train_seed)
             seeds[spec.task] = found
         except BundleError as error:

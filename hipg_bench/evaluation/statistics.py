@@ -18,7 +18,7 @@ _CHUNK = 2_000_000
 """Numbers drawn at once, so that memory stays small."""
 
 Interval = tuple[float, float]
-Runs = Sequence[Float[np.ndarray, "episodes"]]
+Runs = Sequence[Float[np.ndarray, "_"]]
 """One task: the values of every episode, an array per training run."""
 
 
@@ -50,7 +50,7 @@ def _run_means(runs: Runs, reps: int, chance: np.random.Generator) -> Float[np.n
     return means
 
 
-def _episode_means(run: Float[np.ndarray, "episodes"], times: int, chance: np.random.Generator) -> np.ndarray:
+def _episode_means(run: Float[np.ndarray, "_"], times: int, chance: np.random.Generator) -> np.ndarray:
     """Means of the run's episodes drawn with replacement."""
     step = max(1, _CHUNK // run.size)
     sizes = [min(step, times - start) for start in range(0, times, step)]

@@ -1,0 +1,203 @@
+"""The command line in processes of its own: exit codes, messages, files, interruption."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hipg_bench import make, task_spec, tasks
+
+# a test run in the background ignores SIGINT, and so would its children
+MAIN = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
+    "from hipg_bench.cli import main; main()"
+)
+TASK = "hazard_nav-4"
+
+
+def command(*args):
+    return [sys.executable, "-c", MAIN, *map(str, args)]
+
+
+def run(*args, cwd=None):
+    return subprocess.run(command(*args), capture_output=True, text=True, timeout=120, cwd=cwd, check=False)
+
+
+def test_help_is_quick_because_it_imports_nothing_heavy():
+    code = (
+        "import sys, hipg_bench.cli;"
+        "print({'numpy', 'mujoco', 'torch', 'pydantic', 'scipy', 'matplotlib'} & set(sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"
+    done = run("--help")
+    assert done.returncode == 0
+    for name in ("evaluate", "train", "tasks", "agents", "calibrate", "bench"):
+        assert name in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (
+            ("evaluate", "--tasks", "hazard_nv-4", "--agent", "zero"),
+            "no task 'hazard_nv-4'; did you mean 'hazard_nav-4'?",
+        ),
+        (("evaluate", "--agent", "randm"), "no agent 'randm'; did you mean 'random'?"),
+        (("tasks", "show", "multwalker-3"), "did you mean 'multiwalker-3'?"),
+        (("agents", "show", "scriptd"), "did you mean 'scripted'?"),
+        (("calibrate", "hazard_nav4"), "did you mean 'hazard_nav-4'?"),
+        (("bench", "--tasks", "hazard_nav4"), "did you mean 'hazard_nav-4'?"),
+        (("bench", "--tasks", TASK, "--num-envs", "1,x"), "whole numbers"),
+        (("evaluate", "--episodes", "0"), "--episodes"),
+        (("evaluate", "--agent", "scripted", "--tasks", "multiwalker-3"), "plays none of these tasks"),
+    ],
+)
+def test_mistakes_are_told_in_a_line_with_exit_code_2(args, message, tmp_path):
+    done = run(*args, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_evaluate_end_to_end(tmp_path):
+    args = (
+        "evaluate",
+        "--agent",
+        "random",
+        "--tasks",
+        f"{TASK},multiwalker-3",
+        "--episodes",
+        6,
+        "--video",
+        0,
+    )
+    done = run(*args, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    # not a terminal: no progress bars
+    assert done.stderr == ""
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.startswith("random-")
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert names == {
+        "run.json", "results.json", "report.html", f"episodes/{TASK}.jsonl", "episodes/multiwalker-3.jsonl",
+    }  # fmt: skip
+    results = json.loads((folder / "results.json").read_text())
+    assert [task["task"] for task in results["tasks"]] == [TASK, "multiwalker-3"]
+    for task in results["tasks"]:
+        assert task["episodes"] == 6
+        assert f"{task['return_mean']:.1f}" in done.stdout
+        assert sum(task["end_reasons"].values()) == 6
+    assert "6 episodes per policy: not for comparison" in done.stdout
+
+
+def test_evaluate_prints_json_for_scripts(tmp_path):
+    done = run(
+        "evaluate",
+        "--agent",
+        "zero",
+        "--tasks",
+        TASK,
+        "--episodes",
+        2,
+        "--video",
+        0,
+        "--json",
+        "--out",
+        tmp_path,
+    )
+    assert json.loads(done.stdout) == json.loads((tmp_path / "results.json").read_text())
+
+
+def test_the_same_command_gives_the_same_bytes_whatever_the_batch(tmp_path):
+    rows = set()
+    for num_envs, threads in ((1, 1), (7, 2), (64, 1)):
+        out = tmp_path / f"{num_envs}"
+        done = run(
+            "evaluate", "--agent", "scripted_blind", "--tasks", TASK, "--episodes", 66, "--video", 0,
+            "--num-envs", num_envs, "--threads", threads, "--out", out,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        rows.add((out / f"episodes/{TASK}.jsonl").read_bytes())
+    assert len(rows) == 1
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_interrupted_then_resumed_gives_the_same_rows(tmp_path, how):
+    args = ["evaluate", "--agent", "random", "--tasks", TASK, "--episodes", 200, "--video", 0, "--threads", 1]
+    rows = tmp_path / "cut" / "episodes" / f"{TASK}.jsonl"
+    child = subprocess.Popen(
+        command(*args, "--num-envs", 1, "--out", tmp_path / "cut"), stderr=subprocess.PIPE, text=True
+    )
+    until = time.monotonic() + 60
+    while not (rows.exists() and rows.read_text().count("\n") > 5):
+        assert child.poll() is None, "it ended before it could be interrupted"
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    os.kill(child.pid, how)
+    _, said = child.communicate(timeout=30)
+    if how == signal.SIGINT:
+        assert child.returncode == 130
+        assert "Traceback" not in said
+        assert not list((tmp_path / "cut").rglob(".*"))
+    partial = rows.read_text()
+    assert partial.endswith("}\n")
+    assert partial.count("\n") < 200
+    assert run(*args, "--out", tmp_path / "cut").returncode == 0
+    assert run(*args, "--out", tmp_path / "whole").returncode == 0
+    whole = (tmp_path / "whole" / "episodes" / f"{TASK}.jsonl").read_text()
+    assert whole.startswith(partial)
+    assert rows.read_text() == whole
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path):
+    args = ["evaluate", "--tasks", TASK, "--episodes", 2, "--video", 0, "--out", tmp_path]
+    assert run(*args, "--agent", "zero").returncode == 0
+    done = run(*args, "--agent", "random")
+    assert done.returncode == 2
+    assert "agent is 'zero' there and 'random' here" in done.stderr
+
+
+def test_task_tables_are_those_of_the_environment():
+    env = make("hazard_comm-10")
+    shown = json.loads(run("tasks", "show", "hazard_comm-10", "--json").stdout)
+    assert (shown["task"], shown["fingerprint"]) == (
+        "hazard_comm-10",
+        task_spec("hazard_comm-10").fingerprint,
+    )
+    sizes = {"observation": env.observation_size, "action": env.action_size, "state": env.state_size}
+    for name, size in sizes.items():
+        columns = [
+            column
+            for block in shown["vectors"][name]
+            for column in range(block["columns"][0], block["columns"][1] + 1)
+        ]
+        assert columns == list(range(size))
+    table = run("tasks", "show", "hazard_comm-10").stdout
+    for block in shown["vectors"]["observation"]:
+        assert block["name"] in table
+        assert block["visible"] in table
+    assert f"{env.observation_size} numbers" in table
+
+
+def test_lists():
+    listed = json.loads(run("tasks", "--json").stdout)
+    assert [task["task"] for task in listed] == list(tasks())
+    agents = {agent["name"]: agent for agent in json.loads(run("agents", "--json").stdout)}
+    assert agents["random"]["builtin"] == "random"
+    assert TASK in [task["task"] for task in agents["scripted"]["tasks"]]
+    text = run("tasks").stdout
+    for task, spec in tasks().items():
+        assert task in text
+        assert spec.summary in text
+    assert run("agents", "show", "random").returncode == 0
+
+
+def test_bench_prints_json():
+    done = run("bench", "--tasks", TASK, "--num-envs", "1,4", "--threads", "1", "--seconds", "0.1", "--json")
+    assert [(rate["num_envs"], rate["threads"]) for rate in json.loads(done.stdout)] == [(1, 1), (4, 1)]
