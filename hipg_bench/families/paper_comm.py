@@ -139,7 +139,7 @@ class PaperComm:
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from the hazard, and from every contact."""
-        hazardous = np.ones((1, len(now.health)), bool)
+        hazardous = np.ones((len(now.health), 1), bool)
         burn = particles.burn(self.params, now.away.distance[_HAZARD:], hazardous, self.spec.control_step)
         return particles.harm(self.params, burn, self._touching(now), was.health > 0)
 

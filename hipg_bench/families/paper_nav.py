@@ -139,7 +139,7 @@ class PaperNav:
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from every hazardous landmark within reach, and from contacts where the spec says so."""
-        burn = particles.burn(self.params, now.away.distance, now.hazardous.T, self.spec.control_step)
+        burn = particles.burn(self.params, now.away.distance, now.hazardous, self.spec.control_step)
         return particles.harm(self.params, burn, particles.touching(now.apart, self.radius), was.health > 0)
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:

@@ -20,7 +20,7 @@ from hipg_bench.families.scene import asset, attach
 from hipg_bench.layout import Block, Layout
 from hipg_bench.mechanics import hazards, histogram
 from hipg_bench.mechanics import health as health_law
-from hipg_bench.mechanics.pairs import Gaps, between_agents, members, of_both, repulsion
+from hipg_bench.mechanics.pairs import Gaps, between_agents, few, members, of_both, repulsion
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params, TaskSpec
 
@@ -188,7 +188,7 @@ def harm(
         touch: pairs that overlap.
         alive: before this step.
     """
-    which, world = np.nonzero(touch)
+    which, world = few(touch)
     one, other = (agents[which] for agents in members(alive.shape[1]))
     crash = np.zeros_like(burn)
     risk = np.where(alive[world, one] & alive[world, other], -np.log1p(-params.collision_risk), 0.0)
@@ -201,14 +201,15 @@ def harm(
 def burn(
     params: ParticleParams,
     distance: Float[np.ndarray, "L N B"],
-    hazardous: Bool[np.ndarray, "L B"],
+    hazardous: Bool[np.ndarray, "B L"],
     control_step: float,
 ) -> Float[np.ndarray, "B N"]:
     """Exposure of each agent from the points that are hazardous, nats."""
     exposure = np.zeros((distance.shape[2], distance.shape[1]))
-    # few agents are near a hazard: the law is worked out only for them
-    point, agent, world = np.nonzero((distance < params.hazard_radius) & hazardous[:, None])
+    # few agents are near a point: the law is worked out only for them
+    point, agent, world = few(distance < params.hazard_radius)
     risk = hazards.risk(distance[point, agent, world], params.hazard_radius, params.hazard_peak)
+    risk = np.where(hazardous[world, point], risk, 0.0)
     np.add.at(exposure, (world, agent), health_law.hazard_rate(risk, control_step / 0.1))
     return exposure
 

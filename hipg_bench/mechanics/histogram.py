@@ -34,11 +34,14 @@ def cells(
     x, y = np.abs(gap[0]), np.abs(gap[1])
     code = (y * _HALF_SECTOR >= x).view(np.uint8)
     for bit in (x * _HALF_SECTOR >= y, gap[1] < 0, gap[0] < 0):
-        code = (code << 1) | bit.view(np.uint8)
+        code <<= 1
+        code |= bit.view(np.uint8)
     cell = (distance > EDGES[0]).view(np.uint8)
     for edge in EDGES[1:]:
-        cell = cell + (distance > edge).view(np.uint8)
-    return (cell << 3) + _SECTOR[code]
+        cell += (distance > edge).view(np.uint8)
+    cell <<= 3
+    cell += _SECTOR[code]
+    return cell
 
 
 def opposite(cell: UInt8[np.ndarray, "*many"]) -> UInt8[np.ndarray, "*many"]:
@@ -61,8 +64,8 @@ def tally(
         num_agents: N.
     """
     worlds = cell.shape[1]
-    first = (np.arange(worlds) * num_agents + observer[:, None]) * _CELLS
-    index = first + np.where(counted, cell, np.uint8(_BEYOND))
+    index = np.where(counted, cell, np.uint8(_BEYOND)).astype(np.int64)
+    index += (np.arange(worlds) * num_agents + observer[:, None]) * _CELLS
     count = np.bincount(index.ravel(), minlength=worlds * num_agents * _CELLS)
     return count.reshape(worlds, num_agents, _CELLS)[..., :_BEYOND].reshape(
         worlds, num_agents, RINGS, SECTORS

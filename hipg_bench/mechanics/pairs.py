@@ -65,6 +65,11 @@ def table(holds: Bool[np.ndarray, "P B"], num_agents: int) -> Bool[np.ndarray, "
     return full
 
 
+def few(holds: Bool[np.ndarray, "*axes"]) -> tuple[Int[np.ndarray, "n"], ...]:
+    """`np.nonzero`, several times faster where few entries of several axes hold."""
+    return np.unravel_index(np.flatnonzero(holds), holds.shape)
+
+
 def repulsion(
     apart: Gaps, solid: Bool[np.ndarray, "B N"], reach: float, stiffness: float, margin: float
 ) -> Float[np.ndarray, "B N 2"]:
@@ -81,7 +86,7 @@ def repulsion(
         margin: depth over which the contact sets in, m.
     """
     first, second = members(solid.shape[1])
-    which, world = np.nonzero(apart.distance < reach + _FADE * margin)
+    which, world = few(apart.distance < reach + _FADE * margin)
     one, other, distance = first[which], second[which], apart.distance[which, world]
     push = solid[world, one] & solid[world, other] & (distance > 0)
     which, world, one, other, distance = which[push], world[push], one[push], other[push], distance[push]
