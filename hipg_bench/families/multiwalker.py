@@ -302,7 +302,7 @@ class MultiWalker:
         ))  # fmt: skip
 
     def _proprioception_blocks(self, lead: tuple[int, ...]) -> tuple[Block, ...]:
-        d, turns, joints = len(self._axes), len(self._turns), len(self.body.stance)
+        d, turns, joints = len(self._axes), len(self._turns), self.body.joints
         heading = (
             () if self.params.planar else (Block("heading", (*lead, 3), "1", "world's x axis in the body's"),)
         )

@@ -37,7 +37,7 @@ class Body:
     Attributes:
         file: its name in ``assets/``.
         planar: root of 2 slides and a hinge, instead of a free joint.
-        stance: (L,) joint angles at which the servos rest at zero input, rad.
+        stance: (2, L) joint angles of the legs at which the servos rest at zero input, rad.
         servo: (L,) whether the joint is driven.
         hip: (2, 3) hips in the torso's frame, m.
         thigh, shin: lengths, m.
@@ -62,20 +62,24 @@ class Body:
     plank_rest: float
 
     @property
-    def coordinates(self) -> int:
-        """Generalised positions of a walker."""
-        return (3 if self.planar else 7) + 2 * len(self.stance)
+    def joints(self) -> int:
+        """L, of a leg."""
+        return self.stance.shape[1]
 
     @property
-    def freedoms(self) -> int:
-        """Generalised velocities of a walker."""
-        return (3 if self.planar else 6) + 2 * len(self.stance)
+    def root_q(self) -> int:
+        """Generalised positions of a free body."""
+        return 3 if self.planar else 7
+
+    @property
+    def root_v(self) -> int:
+        """Generalised velocities of a free body."""
+        return 3 if self.planar else 6
 
     @property
     def height(self) -> float:
         """Of the torso's origin above the ground in the stance, m."""
-        joint = np.broadcast_to(self.stance, (2, len(self.stance)))
-        return float(-sole_height(self, np.eye(3), joint).min())
+        return float(-sole_height(self, np.eye(3), self.stance).min())
 
 
 @functools.cache
@@ -83,23 +87,26 @@ def body_of(planar: bool) -> Body:
     """Read the spatial or the planar walker."""
     file = "walker_planar.xml" if planar else "walker.xml"
     walker = asset(file)
-    joints = [joint.name.removeprefix("left_") for joint in walker.joints if joint.name.startswith("left_")]
-    servos = {motor.target.removeprefix("left_"): motor for motor in walker.actuators}
-    rest = {name: -motor.biasprm[0] / motor.biasprm[1] for name, motor in servos.items()}
-    # the ankle holds the foot level in the stance
-    rest["ankle"] = rest["knee"] - rest["hip"]
+    joints = [joint.name for joint in walker.joints if joint.name.startswith(("left_", "right_"))]
+    rest = {motor.target: -motor.biasprm[0] / motor.biasprm[1] for motor in walker.actuators}
+    servo = [name in rest for name in joints[: len(joints) // 2]]
+    for side in ("left", "right"):
+        # the ankle holds the foot level in the stance
+        rest[f"{side}_ankle"] = rest[f"{side}_knee"] - rest[f"{side}_hip"]
     foot, head, board = walker.geom("left_foot"), walker.geom("head"), asset("plank.xml").geom("board")
     head_top = float(head.fromto[2] + head.size[0])
     flat = foot.type == mujoco.mjtGeom.mjGEOM_BOX
+    ankle = walker.body("left_foot").pos if flat else foot.pos
+    sole = foot.pos - np.array([0.0, 0.0, foot.size[2]]) if flat else np.zeros(3)
     return Body(
         file=file,
         planar=planar,
-        stance=np.array([rest[name] for name in joints]),
-        servo=np.array([name in servos for name in joints]),
+        stance=np.array([rest[name] for name in joints]).reshape(2, -1),
+        servo=np.array(servo),
         hip=np.stack([walker.body(f"{side}_thigh").pos for side in ("left", "right")]),
         thigh=float(-walker.body("left_shin").pos[2]),
-        shin=float(-walker.body("left_foot").pos[2]),
-        sole=foot.pos - np.array([0.0, 0.0, foot.size[2]]) if flat else foot.pos.copy(),
+        shin=float(-ankle[2]),
+        sole=sole,
         sole_size=foot.size[:2].copy() if flat else np.zeros(2),
         sole_radius=0.0 if flat else float(foot.size[0]),
         head_top=head_top,
@@ -141,6 +148,14 @@ def walker_scene(body: Body, num_agents: int, spacing: float, overhang: float, m
     scene = asset("arena.xml")
     scene.option.iterations = scene.option.ls_iterations = 8
     scene.geom("floor").contype = 1
+    size = half_length(num_agents, spacing, overhang) / 1.55
+    # shadows are cast within the extent
+    scene.stat.extent *= size
+    top, overview = scene.camera("top"), scene.camera("overview")
+    top.pos = top.pos * size
+    # from the side, or the plank hides its carriers
+    overview.pos = np.array([0.0, -3.4 * size, 0.45 + 0.3 * size])
+    overview.alt.xyaxes = np.array([1.0, 0.0, 0.0, 0.0, 0.09, 0.996])
     for i, seat in enumerate(seats(num_agents, spacing).tolist()):
         walker = asset(body.file)
         _stand(walker, "torso", (seat, 0.0, body.height))
@@ -208,13 +223,12 @@ class Pose:
 def pose(body: Body, sim: Sim, rows: Rows = EVERY) -> Pose:
     """Read all bodies, as copies."""
     q, v = sim.position[rows], sim.velocity[rows]
-    root_q = body.coordinates - 2 * len(body.stance)
-    root_v = body.freedoms - 2 * len(body.stance)
-    walker_q = q[:, :-root_q].reshape(len(q), -1, body.coordinates)
-    walker_v = v[:, :-root_v].reshape(len(q), -1, body.freedoms)
+    root_q, root_v = body.root_q, body.root_v
+    walker_q = q[:, :-root_q].reshape(len(q), -1, root_q + 2 * body.joints)
+    walker_v = v[:, :-root_v].reshape(len(q), -1, root_v + 2 * body.joints)
     root = np.concatenate([walker_q[..., :root_q], q[:, None, -root_q:]], axis=1)
     rate = np.concatenate([walker_v[..., :root_v], v[:, None, -root_v:]], axis=1)
-    legs = (*walker_q.shape[:2], 2, len(body.stance))
+    legs = (*walker_q.shape[:2], 2, body.joints)
     joint, joint_rate = walker_q[..., root_q:].reshape(legs), walker_v[..., root_v:].reshape(legs)
     if not body.planar:
         return Pose(
@@ -283,8 +297,7 @@ def sole_height(
 
 def chance_size(body: Body, num_agents: int) -> int:
     """Uniform numbers that `place` takes."""
-    root_v = body.freedoms - 2 * len(body.stance)
-    return num_agents * (2 * int(body.servo.sum()) + 3 + root_v) + 3
+    return num_agents * (2 * int(body.servo.sum()) + 3 + body.root_v) + 3
 
 
 def place(
@@ -303,11 +316,11 @@ def place(
         chance: uniform numbers, `chance_size` of them.
         seat: places along x, m.
     """
-    count, agents, legs = len(ids), len(seat), len(body.stance)
+    count, agents = len(ids), len(seat)
     draw = 2 * chance - 1
     per_walker = draw[:, :-3].reshape(count, agents, -1)
     servos = 2 * int(body.servo.sum())
-    joint = np.tile(body.stance, (count, agents, 2, 1))
+    joint = np.tile(body.stance, (count, agents, 1, 1))
     joint[..., body.servo] += _JOINT_SPREAD * per_walker[..., :servos].reshape(count, agents, 2, -1)
     if not body.planar:
         joint[..., 3] = joint[..., 2] - joint[..., 1]  # feet level
@@ -326,7 +339,7 @@ def place(
     walker_q = np.concatenate([root[:, :-1], joint.reshape(count, agents, -1)], axis=-1)
     sim.position[ids] = np.concatenate([walker_q.reshape(count, -1), root[:, -1]], axis=1)
     speed = _SPEED_SPREAD * per_walker[..., servos + 3 :]
-    walker_v = np.concatenate([speed, np.zeros((count, agents, 2 * legs))], axis=-1).reshape(count, -1)
+    walker_v = np.concatenate([speed, np.zeros((count, agents, 2 * body.joints))], axis=-1).reshape(count, -1)
     sim.velocity[ids] = 0.0
     sim.velocity[ids, : walker_v.shape[1]] = walker_v
 
