@@ -287,7 +287,9 @@ class PaperNav:
             distance = np.where(now.health.T > 0, distance, np.inf)
         nearest = distance.min(axis=1)
         nearest = np.where(np.isinf(nearest), self.params.nobody, nearest)
-        return np.where(now.hazardous.T, 0.0, nearest).sum(axis=0)
+        charged = np.where(now.hazardous.T, 0.0, nearest)
+        # one after the other: the order in which np.sum adds depends on the number of worlds
+        return np.add.accumulate(charged, axis=0)[-1]
 
     def _overlaps(self, now: Snapshot) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
         """Overlapping pairs of which both live, and of which one does."""
