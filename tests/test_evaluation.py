@@ -153,7 +153,7 @@ def test_interrupted_and_resumed_gives_the_same_bytes(tmp_path):
         name = f"episodes/{task}.jsonl"
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     before, after = (json.loads((tmp_path / run / "results.json").read_text()) for run in ("whole", "parts"))
-    assert {**before, "timing": 0} == {**after, "timing": 0}
+    assert {**before, "seconds": 0} == {**after, "seconds": 0}
 
 
 def test_a_longer_evaluation_extends_a_shorter_one(tmp_path):
@@ -230,6 +230,16 @@ def test_films_are_of_the_median_then_from_worst_to_best(tmp_path):
     env = make(TASK)
     filmed = [env.recall(np.load(job.saved)["rows"][-1:], "return")[0, 0] for job in jobs]
     assert filmed == [returns[10], returns[0], returns[-1]]
+    # a longer evaluation has another median episode: its film replaces the old one, and only that
+    for job in jobs:
+        job.video.parent.mkdir(exist_ok=True)
+        job.video.write_bytes(b"film")
+    extra = [{**rows[0], "world": 100 + k, "return": returns[-1], "train_seed": 1} for k in range(2)]
+    films.choose(agent, spec, rows + extra, plan, 3, tmp_path)
+    assert [job.video.exists() for job in jobs] == [True, True, True]
+    fewer = [row for row in rows if row["return"] > returns[4]]
+    films.choose(agent, spec, fewer, plan, 3, tmp_path)
+    assert [job.video.exists() for job in jobs] == [False, False, True]
 
 
 class Links(html.parser.HTMLParser):

@@ -57,7 +57,7 @@ def evaluate(
         ids = {name: bars.add_task(name, total=total) for name, total in totals.items()}
         results = runner.evaluate(
             who, suite, folder, plan, films_per_task=films,
-            progress=lambda stage, done: bars.advance(ids[stage], done),
+            progress=lambda stage, done: bars.advance(ids[stage], done) if stage in ids else None,
         )  # fmt: skip
     if as_json:
         console.show_json(results)

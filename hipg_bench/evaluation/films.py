@@ -1,4 +1,4 @@
-"""Films of chosen episodes: played again alone, saved as state rows, rendered by two child processes.
+"""Films of chosen episodes: played again alone, saved as state rows, rendered two at a time.
 
 Scoring never needs graphics. Where no frame can be rendered, the scores stand and the message says
 what to install.
@@ -7,39 +7,40 @@ what to install.
 from __future__ import annotations
 
 import dataclasses
-import json
-import subprocess
-import sys
-import tempfile
-import time
+import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
-from hipg_bench.errors import HipgError
+from hipg_bench.errors import RenderError
 from hipg_bench.evaluation.episodes import Plan, Row
 from hipg_bench.paths import replacing
 from hipg_bench.policies.bundle import Agent
-from hipg_bench.spec import TaskSpec, parse
+from hipg_bench.rendering import film, gl
+from hipg_bench.spec import TaskSpec
 
-_CHILDREN = 2
+_AT_ONCE = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class Job:
+class Film:
     """One film.
 
     Attributes:
-        task: of which task.
+        spec: of which task.
+        agent: who plays.
         title: what is seen.
+        end_reason: why the episode ended.
         saved: state rows, written.
         video: the film, to be made.
     """
 
-    task: str
+    spec: TaskSpec
+    agent: str
     title: str
+    end_reason: str
     saved: Path
     video: Path
 
@@ -49,7 +50,9 @@ class Job:
         return f"{self.video.parent.name}/{self.video.name}"
 
 
-def choose(agent: Agent, spec: TaskSpec, rows: Sequence[Row], plan: Plan, count: int, out: Path) -> list[Job]:
+def choose(
+    agent: Agent, spec: TaskSpec, rows: Sequence[Row], plan: Plan, count: int, out: Path
+) -> list[Film]:
     """Pick the median episode of the first training seed, then others from worst to best; save the states."""
     first_seed = min(row["train_seed"] for row in rows)
     ranked = sorted(
@@ -57,78 +60,84 @@ def choose(agent: Agent, spec: TaskSpec, rows: Sequence[Row], plan: Plan, count:
         key=lambda row: (row["return"], row["world"]),
     )
     others = np.linspace(0.0, 1.0, max(count - 1, 1)).tolist()[: max(count - 1, 0)]
-    jobs: list[Job] = []
+    chosen: list[Film] = []
     for quantile in [0.5, *others][:count]:
         row = ranked[round(quantile * (len(ranked) - 1))]
-        median = not jobs
+        median = not chosen
         name = spec.task if median else f"{spec.task}-q{round(100 * quantile):03d}"
         what = "the median episode" if median else f"quantile {quantile:.2f}"
-        jobs.append(
-            Job(
-                task=spec.task,
+        chosen.append(
+            Film(
+                spec=spec,
+                agent=agent.name,
+                end_reason=row["end_reason"],
                 title=f"{what}: return {row['return']:.1f}, {row['deaths']} dead",
                 saved=out / "films" / f"{name}.npz",
                 video=out / "videos" / f"{name}.mp4",
             )
         )
-        if not jobs[-1].saved.exists():
-            _save(agent, spec, row, plan, jobs[-1].saved)
-    return jobs
+        if not _is_of(chosen[-1].saved, row):
+            chosen[-1].video.unlink(missing_ok=True)
+            _save(agent, spec, row, plan, chosen[-1].saved)
+    return chosen
 
 
-def make(jobs: Sequence[Job], advance: Callable[[float], None]) -> tuple[list[Job], list[str]]:
-    """Render what is not yet rendered; return the films there are, and what went wrong with the others."""
-    made = {job for job in jobs if job.video.exists()}
-    advance(len(made))
-    waiting = [job for job in jobs if job not in made]
-    running: list[tuple[Job, subprocess.Popen[bytes], IO[bytes]]] = []
+def make(films: Sequence[Film], advance: Callable[[float], None]) -> tuple[list[Film], list[str]]:
+    """Render what is not yet rendered.
+
+    Returns:
+        The films there are, and what went wrong with the others.
+    """
+    waiting = [one for one in films if not one.video.exists()]
+    advance(len(films) - len(waiting))
+    if waiting:
+        # tried once, before the threads ask for it
+        gl.working_backend()
+    stop = threading.Event()
     trouble: list[str] = []
-    try:
-        while waiting or running:
-            while waiting and len(running) < _CHILDREN:
-                running.append(_start(waiting.pop(0)))
-            time.sleep(0.05)
-            for entry in [entry for entry in running if entry[1].poll() is not None]:
-                job, child, said = entry
-                running.remove(entry)
-                if child.returncode == 0:
-                    made.add(job)
-                else:
-                    said.seek(0)
-                    trouble.append(said.read().decode(errors="replace").strip() or f"{job.file}: no film")
-                advance(1)
-    finally:
-        for _, child, _ in running:
-            child.terminate()
-            child.wait()
-    return [job for job in jobs if job in made], list(dict.fromkeys(trouble))
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        pending = [pool.submit(_make_one, one, stop, advance) for one in waiting]
+        try:
+            for future in pending:
+                try:
+                    future.result()
+                except RenderError as error:
+                    trouble.append(str(error))
+        finally:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+    return [one for one in films if one.video.exists()], list(dict.fromkeys(trouble))
+
+
+def _make_one(one: Film, stop: threading.Event, advance: Callable[[float], None]) -> None:
+    """Render a film in a child process, unless told to stop."""
+    told = 0.0
+
+    def progress(frames: int, total: int) -> None:
+        nonlocal told
+        if stop.is_set():
+            raise RenderError(f"{one.file}: interrupted")
+        advance(frames / total - told)
+        told = frames / total
+
+    with np.load(one.saved, allow_pickle=False) as saved:
+        rows = saved["rows"]
+    film.record(one.spec, rows, one.video, agent=one.agent, end_reason=one.end_reason, progress=progress)
+
+
+def _is_of(saved: Path, row: Row) -> bool:
+    """Whether an episode is already saved, and not another one of an evaluation that was shorter."""
+    if not saved.exists():
+        return False
+    with np.load(saved, allow_pickle=False) as file:
+        return (int(file["train_seed"]), int(file["world"])) == (row["train_seed"], row["world"])
 
 
 def _save(agent: Agent, spec: TaskSpec, row: Row, plan: Plan, path: Path) -> None:
+    """Keep an episode's state rows, and what is needed to read them."""
     rows = plan.record(spec, agent.policy(spec, row["train_seed"]), row)
     with replacing(path) as temporary:
-        np.savez_compressed(temporary, rows=rows, spec=spec.model_dump_json(), agent=agent.name)
-
-
-def _start(job: Job) -> tuple[Job, subprocess.Popen[bytes], IO[bytes]]:
-    """Render in a process of its own: a graphics driver may take its process down with it."""
-    job.video.parent.mkdir(parents=True, exist_ok=True)
-    said = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
-    command = [sys.executable, "-m", __name__, str(job.saved), str(job.video)]
-    return job, subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said), said
-
-
-def _render(saved: Path, video: Path) -> None:
-    """Turn saved state rows into a film, here."""
-    from hipg_bench.rendering import film
-
-    with np.load(saved, allow_pickle=False) as file:
-        spec = parse(TaskSpec, json.loads(str(file["spec"])), str(saved))
-        film.record(spec, file["rows"], video, agent=str(file["agent"]))
-
-
-if __name__ == "__main__":
-    try:
-        _render(Path(sys.argv[1]), Path(sys.argv[2]))
-    except HipgError as error:
-        sys.exit(str(error))
+        np.savez_compressed(
+            temporary, rows=rows, spec=spec.model_dump_json(), agent=agent.name,
+            train_seed=row["train_seed"], world=row["world"],
+        )  # fmt: skip

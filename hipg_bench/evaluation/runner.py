@@ -12,10 +12,11 @@ An interrupted evaluation goes on where it stopped, and ends with the same rows.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,24 +93,20 @@ def evaluate(
     """
     seeds, skipped = playable(agent, suite)
     _claim(out, {"agent": agent.name, "seed": plan.seed, "versions": versions()})
+    timing: dict[str, float] = {}
     rows: dict[str, list[Row]] = {}
-    timing: dict[str, dict[str, float]] = {}
     for spec in suite.specs:
         if spec.task in seeds:
-            started = time.perf_counter()
-            rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, progress)
-            timing[spec.task] = {"seconds": round(time.perf_counter() - started, 3)}
+            with _timed(timing, spec.task):
+                rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, progress)
     played = [spec for spec in suite.specs if spec.task in rows]
-    made, trouble = [], []
-    if films_per_task:
-        started = time.perf_counter()
-        jobs = [
-            job
+    with _timed(timing, "films"):
+        chosen = [
+            one
             for spec in played
-            for job in films.choose(agent, spec, rows[spec.task], plan, films_per_task, out)
+            for one in films.choose(agent, spec, rows[spec.task], plan, films_per_task, out)
         ]
-        made, trouble = films.make(jobs, lambda done: progress("films", done))
-        timing["films"] = {"seconds": round(time.perf_counter() - started, 3)}
+        made, trouble = films.make(chosen, lambda done: progress("films", done))
     results = {
         "schema": SCHEMA,
         "suite": suite.name,
@@ -121,13 +118,21 @@ def evaluate(
         "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in suite.specs]),
         "tasks": [summarise(spec, rows[spec.task]) for spec in played],
         "skipped": [{"task": task, "reason": reason} for task, reason in skipped.items()],
-        "films": [{"task": job.task, "file": job.file, "title": job.title} for job in made],
+        "films": [{"task": one.spec.task, "file": one.file, "title": one.title} for one in made],
         "film_trouble": trouble,
-        "timing": timing,
+        "seconds": timing,
     }
     write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
     write_text(out / "report.html", report.render(results, rows, {spec.task: spec for spec in played}))
     return results
+
+
+@contextlib.contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Generator[None]:
+    """Note how long a block took."""
+    started = time.perf_counter()
+    yield
+    seconds[name] = round(time.perf_counter() - started, 3)
 
 
 def _play_task(
