@@ -1,0 +1,65 @@
+"""Where the camera stands, and where a place in the world falls on the picture."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+FIELD_OF_VIEW = 38.0
+"""Vertical, degrees; that of ``arena.xml``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A view that looks at a place.
+
+    Attributes:
+        target: the place, m.
+        distance: from it, m.
+        azimuth: 0 looks along +x, 90 along +y, degrees.
+        elevation: negative looks down, degrees.
+    """
+
+    target: np.ndarray
+    distance: float
+    azimuth: float
+    elevation: float
+
+    def mujoco(self) -> mujoco.MjvCamera:
+        """The same for MuJoCo."""
+        camera = mujoco.MjvCamera()
+        camera.type = int(mujoco.mjtCamera.mjCAMERA_FREE)
+        camera.lookat[:] = self.target
+        camera.distance, camera.azimuth, camera.elevation = self.distance, self.azimuth, self.elevation
+        return camera
+
+    def project(
+        self, places: Float[np.ndarray, "n 3"], width: int, height: int
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+        """Pixels from the upper left corner, and depth along the view, m (negative behind the camera)."""
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        ahead = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+        up = np.cross(right, ahead)
+        gap = places - (self.target - self.distance * ahead)
+        depth = gap @ ahead
+        focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+        scale = focal / np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+        return np.stack([width / 2 + scale * (gap @ right), height / 2 - scale * (gap @ up)], axis=-1), depth
+
+
+def follow(time: np.ndarray, place: Float[np.ndarray, "K 3"], smoothing: float) -> Float[np.ndarray, "K 3"]:
+    """A path freed of jitter: each point the mean of its neighbours in time, weighted by a bell.
+
+    Args:
+        time: (K,) seconds.
+        place: m.
+        smoothing: standard deviation of the bell, s.
+    """
+    weight = np.exp(-0.5 * ((time[:, None] - time[None]) / smoothing) ** 2)
+    return (weight / weight.sum(axis=1, keepdims=True)) @ place
