@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 import hipg_bench
 from hipg_bench.mechanics import histogram
@@ -217,7 +218,8 @@ def test_a_contact_kills_each_partner_with_probability_seven_tenths_independentl
 
 def test_collisions_kill_nobody_in_navigation():
     env = hipg_bench.make("paper_nav-4", num_envs=200, threads=1)
-    arrange(env, np.zeros((200, 4, 2)) + [[0, 0], [0.01, 0], [0, 0.01], [0.01, 0.01]], hazardous=0)
+    corners = np.array([[0, 0], [0.01, 0], [0, 0.01], [0.01, 0.01]])
+    arrange(env, np.broadcast_to(corners, (200, 4, 2)), hazardous=0)
     assert env.step(still(env)).info["alive"].all()
 
 
@@ -580,3 +582,74 @@ def test_communication_deaths_are_those_of_the_authors_code():
     harmless = play("paper_comm-10", normal(0), 2500, hazard_peak=0.0)
     assert agree(harmless["deaths"], 0.35, harmless["deaths"].std(), 200)
     assert not harmless["deaths_hazard"].any()
+
+
+def formation(places, cap):
+    """Assign agents to places once, nearest in sum, and hold them there with at most ``cap`` N per axis.
+
+    The authors' gains are not known; these bring a particle to rest in about two steps.
+    """
+    target = []
+
+    def act(env, step):
+        position, velocity = (x.reshape(env.num_envs, -1, 2) for x in (env._sim.position, env._sim.velocity))
+        if not target:
+            goals = places(env)
+            for here, goal in zip(position, goals, strict=True):
+                cost = np.linalg.norm(here[:, None] - goal[None], axis=-1)
+                target.append(goal[linear_sum_assignment(cost)[1]])
+        return np.clip(50 * (np.array(target) - position) - 7.5 * velocity, -cap, cap)
+
+    return act
+
+
+def safe_landmarks(env):
+    hazardous = env._sim.field["hazardous"] > 0
+    return env._sim.marker[..., :2][~hazardous].reshape(env.num_envs, -1, 2)
+
+
+def any_landmarks(env):
+    # the layout is exchangeable, so the first n of n + 1 landmarks are a random choice
+    return env._sim.marker[:, : env.num_agents, :2]
+
+
+def chain(env):
+    ends = env._sim.marker[:, :2, :2]
+    share = (np.arange(env.num_agents) + 1) / (env.num_agents + 1)
+    return ends[:, :1] + share[:, None] * (ends[:, 1:] - ends[:, :1])
+
+
+@pytest.mark.parametrize(
+    ("places", "cap", "curve", "deaths"),
+    [
+        (safe_landmarks, 1.0, -545, None),
+        (safe_landmarks, 5.0, -231, None),
+        (any_landmarks, 1.0, -809, 0.83),
+        (any_landmarks, 5.0, -530, None),
+    ],
+)
+def test_navigation_heuristics_earn_what_they_earn_in_the_authors_code(places, cap, curve, deaths):
+    played = play("paper_nav-4", formation(places, cap), 2000)
+    assert agree(played["curve"], curve, played["curve"].std(), 60)
+    if deaths is not None:
+        assert agree(played["deaths"], deaths, played["deaths"].std(), 60)
+
+
+@pytest.mark.parametrize(
+    ("cap", "peak", "curve"), [(5.0, 0.5, 4483), (5.0, 0.0, 4575), (1.0, 0.5, 3180), (1.0, 0.0, 3540)]
+)
+def test_communication_chain_earns_what_it_earns_in_the_authors_code(cap, peak, curve):
+    played = play("paper_comm-10", formation(chain, cap), 2000, hazard_peak=peak)
+    assert agree(played["curve"], curve, played["curve"].std(), 60)
+    if (cap, peak) == (5.0, 0.5):
+        assert agree(played["deaths"], 1.03, played["deaths"].std(), 60)
+        assert agree(50 * played["connected"], 44.8, (50 * played["connected"]).std(), 60)
+
+
+def test_random_teams_are_almost_never_linked():
+    """The link range was fitted so that random places connect the terminals once in a thousand times."""
+    worlds = 20_000
+    env = hipg_bench.make("paper_comm-10", num_envs=worlds, threads=1)
+    env.reset()
+    linked = env._sim.field["connected"].mean()
+    assert 2e-4 < linked < 2e-3
