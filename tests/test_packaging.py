@@ -59,10 +59,8 @@ def test_the_wheel_holds_the_data_and_nothing_at_top_level(wheel: Path):
     tops = {name.split("/")[0] for name in names}
     assert tops == {"hipg_bench", f"hipg_bench-{hipg_bench.__version__}.dist-info"}
     for kind, pattern in (("assets", "*.xml"), ("tasks", "*.toml"), ("agents", "*/agent.toml")):
-        expected = {
-            f"hipg_bench/data/{kind}/{p.relative_to(CHECKOUT / kind)}"
-            for p in (CHECKOUT / kind).glob(pattern)
-        }
+        files = [path.relative_to(CHECKOUT) for path in (CHECKOUT / kind).glob(pattern)]
+        expected = {f"hipg_bench/data/{path}" for path in files}
         assert expected
         assert expected <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in names)
@@ -87,5 +85,8 @@ def test_an_evaluation_outside_the_checkout(installed: Path, tmp_path: Path):
 
 
 def test_importing_is_light(installed: Path, tmp_path: Path):
-    script = "import hipg_bench, sys; print(sorted({'torch', 'gymnasium', 'matplotlib'} & set(sys.modules)))"
+    script = (
+        "import hipg_bench, sys; hipg_bench.make('hazard_nav-4').reset(); "
+        "print(sorted({'torch', 'gymnasium', 'pettingzoo', 'matplotlib'} & set(sys.modules)))"
+    )
     assert run(installed / "python", "-c", script, cwd=tmp_path).strip() == "[]"

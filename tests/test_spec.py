@@ -40,7 +40,7 @@ def spec() -> TaskSpec:
         ({"hazard_radios": 0.2}, ("'hazard_radios'", "did you mean 'hazard_radius'?")),
         ({"hazard_peak": 1.0}, ("hazard_peak", "1.0", "less than 1")),
         ({"hazard_radius": "wide"}, ("hazard_radius", "'wide'", "number")),
-        ({"weights": {"distanse": 1.0}}, ("'distanse'", "did you mean 'distance'?")),
+        ({"weights": {"distances": 1.0}}, ("'distances'", "did you mean 'distance'?")),
         ({"weights": {"distance": "far"}}, ("distance", "'far'")),
         ({"version": 3}, ("'version'",)),
     ],

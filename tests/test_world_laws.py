@@ -215,3 +215,16 @@ def test_wrong_uses_are_refused_and_harm_nothing(env: BatchEnv):
         assert message in str(refusal.value)
     assert same(rows, env.rows)
     env.step(actions(env, step))
+
+
+def test_an_environment_refuses_to_go_on_before_its_start_and_after_its_end():
+    env = make("hazard_nav-4", 1, threads=1)
+    rest = np.zeros((1, 4, 3))
+    with pytest.raises(hipg_bench.errors.HipgError, match=r"step\(\) before reset"):
+        env.step(rest)
+    env.reset()
+    env.step(rest)
+    env.close()
+    for use in (env.reset, lambda: env.step(rest), lambda: env.load_rows(np.array([0]), env.rows)):
+        with pytest.raises(hipg_bench.errors.HipgError, match="closed"):
+            use()
