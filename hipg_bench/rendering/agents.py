@@ -20,6 +20,8 @@ _AGENT = re.compile(r"(?:drone|walker|particle)(\d+)/")
 """How names of an agent's parts begin."""
 _TINTED = ("paint", "signal", "skin")
 """Materials that take the agent's hue; the others keep their own colour."""
+_TINTED_PARTS = ("shell", "cap")
+"""The same for parts without material."""
 _SHINE = 0.2
 """Least emission of those materials: who is who must be seen in the shade, too."""
 
@@ -57,8 +59,9 @@ class Cast:
         self._emission = np.where(
             tinted, np.maximum(self._model.mat_emission, _SHINE), self._model.mat_emission
         )
-        self._tinted = (self._model.geom_matid >= 0) & tinted[self._model.geom_matid]
         names = [self._model.geom(k).name.rpartition("/")[2] for k in range(self._model.ngeom)]
+        self._tinted = (self._model.geom_matid >= 0) & tinted[self._model.geom_matid]
+        self._tinted |= np.isin(names, _TINTED_PARTS)
         self._blade = np.array([name.startswith("blade") for name in names])
         self._rotor = np.array([name.startswith("rotor") for name in names])
         self._flies = bool(self._blade.any())

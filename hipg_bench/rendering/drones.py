@@ -38,7 +38,7 @@ class Drones:
         self._half = float(footage.spec.params["half_width"])
         # the paper's particles live in a plane
         self._ceiling = float(footage.spec.params.get("ceiling", 0.0))
-        self.reach = 1.6 * self._half + 0.5 * self._ceiling
+        self.reach = 3.2 * self._half
 
     @property
     def places(self) -> Float[np.ndarray, "N 3"]:
@@ -54,7 +54,7 @@ class Drones:
         share = time / (self.footage.spec.horizon * self.footage.spec.control_step)
         if not self._ceiling:
             return Camera(
-                np.array([0.0, -0.05 * self._half, 0.0]), 4.3 * self._half, 86.0 + 8.0 * share, -58.0
+                np.array([0.0, -0.05 * self._half, 0.0]), 3.8 * self._half, 86.0 + 8.0 * share, -58.0
             )
         reach = np.hypot(np.sqrt(2) * self._half, self._ceiling / 2)
         distance = 0.79 * float(reach) / np.tan(np.radians(FIELD_OF_VIEW) / 2)
@@ -75,7 +75,10 @@ class Drones:
             if time - died < _TRAIL:
                 start, end = max(time - _TRAIL, 0.0), min(time, died)
                 brush.trail(self.footage.path(int(self.cast.root[agent]), start, end, 22), 0.007, colour, 0.7)
-            if time < died and place[2] > 0.05:
+            if time < died and not self._ceiling:
+                # some particles are as small as 1 cm
+                brush.ball(place, 0.03, colour, 0.5)
+            if time < died and self._ceiling:
                 brush.line(place, (place[0], place[1], 0.003), 0.0012, colour, 0.22)
                 brush.disc((place[0], place[1], 0.002), 0.022, colour, 0.35)
 

@@ -26,7 +26,7 @@ class Carrying:
     def __init__(self, footage: Footage, cast: Cast) -> None:
         self._footage = footage
         self._cast = cast
-        self.reach = 0.6 * footage.num_agents + 1.2
+        self.reach = 0.6 * footage.num_agents + 3.0
         self._plank = footage.body("plank/plank")
         self._start = footage.body_position[0, self._plank].copy()
         self._way = follow(footage.time, footage.body_position[:, self._plank], _SMOOTHING)
