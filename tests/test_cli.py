@@ -10,6 +10,7 @@ import time
 import pytest
 
 from hipg_bench import make, task_spec, tasks
+from hipg_bench.rendering import gl
 
 # a test run in the background ignores SIGINT, and so would its children
 MAIN = (
@@ -23,8 +24,11 @@ def command(*args):
     return [sys.executable, "-c", MAIN, *map(str, args)]
 
 
-def run(*args, cwd=None):
-    return subprocess.run(command(*args), capture_output=True, text=True, timeout=120, cwd=cwd, check=False)
+def run(*args, cwd=None, **environment):
+    return subprocess.run(
+        command(*args), capture_output=True, text=True, timeout=120, cwd=cwd, check=False,
+        env=os.environ | environment,
+    )  # fmt: skip
 
 
 def test_help_is_quick_because_it_imports_nothing_heavy():
@@ -153,6 +157,38 @@ def test_interrupted_then_resumed_gives_the_same_rows(tmp_path, how):
     whole = (tmp_path / "whole" / "episodes" / f"{TASK}.jsonl").read_text()
     assert whole.startswith(partial)
     assert rows.read_text() == whole
+
+
+# neither EGL nor OSMesa finds a driver
+NO_GL = {"MUJOCO_EGL_DEVICE_ID": "99", "LIBGL_DRIVERS_PATH": "/nonexistent", "GALLIUM_DRIVER": "none"}
+
+
+def test_without_graphics_the_scores_still_come(tmp_path):
+    args = ("evaluate", "--agent", "zero", "--tasks", TASK, "--episodes", 3, "--out", tmp_path)
+    done = run(*args, **NO_GL)
+    assert done.returncode == 0
+    assert TASK in done.stdout
+    assert "apt-get install" in done.stderr
+    assert "apt-get install" in (tmp_path / "report.html").read_text()
+    assert list((tmp_path / "videos").glob("*") if (tmp_path / "videos").exists() else []) == []
+    # the same command where graphics work goes on to make the film
+    assert (tmp_path / "films" / f"{TASK}.npz").exists()
+
+
+@pytest.mark.skipif(gl.working_backend() is None, reason="no OpenGL here")
+def test_interrupted_while_filming_leaves_no_half_film(tmp_path):
+    args = ("evaluate", "--agent", "zero", "--tasks", TASK, "--episodes", 3, "--out", tmp_path)
+    child = subprocess.Popen(command(*args), stderr=subprocess.PIPE, text=True)
+    videos, until = tmp_path / "videos", time.monotonic() + 60
+    while not (videos.exists() and list(videos.iterdir())):
+        assert child.poll() is None, child.stderr.read()
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    os.kill(child.pid, signal.SIGINT)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == 130
+    assert "Traceback" not in said
+    assert list(videos.iterdir()) == []
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):

@@ -5,6 +5,7 @@ import html.parser
 import json
 import tomllib
 
+import imageio.v3
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,6 +19,7 @@ from hipg_bench.evaluation.results import aggregate, summarise
 from hipg_bench.paths import data_folder
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.simple import Constant, Random
+from hipg_bench.rendering import gl
 from hipg_bench.spec import Anchor, Anchors, load
 
 TASK = "hazard_nav-4"
@@ -242,6 +244,24 @@ def test_films_are_of_the_median_then_from_worst_to_best(tmp_path):
     assert [job.video.exists() for job in jobs] == [False, False, True]
 
 
+@pytest.mark.skipif(gl.working_backend() is None, reason="no OpenGL here")
+def test_an_evaluation_has_a_film_of_the_median_episode(tmp_path):
+    short = runner.Suite("custom", (task_spec(TASK).override(horizon=2),))
+    stages = []
+    results = runner.evaluate(
+        load_agent("random"), short, tmp_path, Plan(episodes=3, threads=1), films_per_task=1,
+        progress=lambda stage, done: stages.append((stage, done)),
+    )  # fmt: skip
+    assert results["film_trouble"] == []
+    assert [film["file"] for film in results["films"]] == [f"videos/{TASK}.mp4"]
+    frame = imageio.v3.imread(tmp_path / f"videos/{TASK}.mp4", index=0)
+    assert frame.shape == (720, 1280, 3)
+    assert frame.std() > 5
+    assert f'src="videos/{TASK}.mp4"' in (tmp_path / "report.html").read_text()
+    assert sum(done for stage, done in stages if stage == "films") == pytest.approx(1)
+    assert sum(done for stage, done in stages if stage == TASK) == pytest.approx(3)
+
+
 class Links(html.parser.HTMLParser):
     """Everything a page would load, and its text."""
 
@@ -287,7 +307,7 @@ def test_the_report_opens_offline_and_trusts_no_name(tmp_path):
 
 
 def test_calibration_measures_what_the_rows_say():
-    spec = task_spec(TASK)
+    spec = task_spec(TASK).override(horizon=20)
     measured = calibration.calibrate(spec, 64, threads=1, progress=lambda name, done: None)
     plan = Plan(10_000, 64, threads=1)
     random = [row["return"] for row in plan.play_all(spec, Random(3))]
