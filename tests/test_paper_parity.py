@@ -578,6 +578,7 @@ def test_navigation_returns_and_deaths_are_those_of_the_authors_code():
 def test_communication_deaths_are_those_of_the_authors_code():
     played = play("paper_comm-10", normal(0), 2500)
     assert agree(played["deaths"], 0.64, played["deaths"].std(), 200)
+    assert played["curve"].mean() < 5  # "about 1", of a possible 5000
     assert (played["deaths"] == played["deaths_hazard"] + played["deaths_collision"]).all()
     harmless = play("paper_comm-10", normal(0), 2500, hazard_peak=0.0)
     assert agree(harmless["deaths"], 0.35, harmless["deaths"].std(), 200)
@@ -644,12 +645,3 @@ def test_communication_chain_earns_what_it_earns_in_the_authors_code(cap, peak, 
     if (cap, peak) == (5.0, 0.5):
         assert agree(played["deaths"], 1.03, played["deaths"].std(), 60)
         assert agree(50 * played["connected"], 44.8, (50 * played["connected"]).std(), 60)
-
-
-def test_random_teams_are_almost_never_linked():
-    """The link range was fitted so that random places connect the terminals once in a thousand times."""
-    worlds = 20_000
-    env = hipg_bench.make("paper_comm-10", num_envs=worlds, threads=1)
-    env.reset()
-    linked = env._sim.field["connected"].mean()
-    assert 2e-4 < linked < 2e-3

@@ -102,7 +102,7 @@ class PaperComm:
         """N particles; terminals and hazard are mocap bodies, so that they are part of the row."""
         scene = particles.scene(self.spec, self.params, self.params.agent_radius)
         for name, kind in _MARKERS:
-            add_marker(scene, name, kind)
+            add_marker(scene, name, kind).pos[2] = particles.HEIGHT
         return scene
 
     def reset(self, sim: Sim, ids: Int[np.ndarray, "n"], chance: Float[np.ndarray, "n K"]) -> None:

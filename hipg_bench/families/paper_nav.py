@@ -103,7 +103,7 @@ class PaperNav:
         """N particles and all landmarks; these are mocap bodies, so that they are part of the row."""
         scene = particles.scene(self.spec, self.params, self.radius)
         for i in range(self._points):
-            add_marker(scene, f"point{i}", "point.xml")
+            add_marker(scene, f"point{i}", "point.xml").pos[2] = particles.HEIGHT
         return scene
 
     def reset(self, sim: Sim, ids: Int[np.ndarray, "n"], chance: Float[np.ndarray, "n K"]) -> None:

@@ -29,6 +29,9 @@ CAUSES = ("hazard", "collision")
 _HAZARD, _COLLISION = range(len(CAUSES))
 DEATH_METRICS = tuple(f"deaths_{cause}" for cause in CAUSES)
 
+HEIGHT = 0.03
+"""Of points above the floor, so that a camera sees them; the rules know no height, m."""
+
 LISTED = 5
 """Dead agents that the histogram observation lists."""
 CELLS = (histogram.RINGS, histogram.SECTORS)
@@ -90,7 +93,7 @@ class Past(NamedTuple):
 
 
 def scene(spec: TaskSpec, params: ParticleParams, radius: float) -> mujoco.MjSpec:
-    """A floor with N particles; particle i's joints, shell and motors are prefixed ``drone<i>/``."""
+    """A floor with N particles; particle i's joints, looks and motors are prefixed ``drone<i>/``."""
     world = asset("arena.xml")
     world.option.timestep = spec.control_step
     world.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -105,7 +108,7 @@ def scene(spec: TaskSpec, params: ParticleParams, radius: float) -> mujoco.MjSpe
         for motor in particle.actuators:
             motor.group = i
             motor.gear[0] = factor
-        particle.geom("shell").size[0] = radius
+        particle.geom("foot").size[0] = radius
         attach(world, particle, f"drone{i}/")
     return world
 
