@@ -70,6 +70,11 @@ class Cast:
         """Where an agent is now, m."""
         return self._footage.data.xpos[self.root[agent]].copy()
 
+    @property
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """Of the team, m."""
+        return self._footage.data.xpos[self.root].mean(axis=0)
+
     def dress(self, time: float) -> None:
         """Colour the agents, and lean the drones, as of the time that the footage shows."""
         for agent in range(self._footage.num_agents):

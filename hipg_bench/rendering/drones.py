@@ -31,6 +31,7 @@ class Drones:
     """The box or plane that drones move in, and their traces."""
 
     body_size = 0.055
+    travels = False
 
     def __init__(self, footage: Footage, cast: Cast) -> None:
         self.footage = footage

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class Status:
     colour: tuple[float, ...]
 
 
+@runtime_checkable
 class Look(Protocol):
     """How a family is shown, for one world.
 
@@ -37,9 +38,11 @@ class Look(Protocol):
         legend: what the colours mean, one line.
         body_size: rough radius of an agent, m.
         reach: half the width of what casts shadows, m.
+        travels: whether the team leaves the place where it began.
     """
 
     legend: str
+    travels: bool
     body_size: float
     reach: float
 

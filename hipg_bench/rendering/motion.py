@@ -36,6 +36,7 @@ class Footage:
         model: compiled with visuals.
         data: the world as `show` last left it.
         rows: (K, R) of one episode, in order.
+        body_position: (K, nbody, 3) where every body was at each row, m.
         time: (K,) seconds since the episode began.
         field: name to (K, size), what the episode remembered at each row.
     """
@@ -51,15 +52,40 @@ class Footage:
         self.family = family
         self.model = world_model(spec, family, visual=True)
         self.data = mujoco.MjData(self.model)
-        size = mujoco.mj_stateSize(self.model, _STATE.mjSTATE_INTEGRATION)
-        if rows.ndim != 2 or rows.shape[1] != size or len(rows) == 0:
-            raise RenderError(f"{spec.task}: rows of shape (K >= 1, {size}) are allowed, got {rows.shape}")
+        self.size = mujoco.mj_stateSize(self.model, _STATE.mjSTATE_INTEGRATION)
+        self._scratch = mujoco.MjData(self.model)
+        self.load(rows)
+
+    def load(self, rows: Float[np.ndarray, "K R"]) -> None:
+        """Show other rows of the same task, up to where another episode begins.
+
+        Raises:
+            RenderError: rows of another task, or not finite.
+        """
+        if rows.ndim != 2 or rows.shape[1] != self.size or len(rows) == 0:
+            raise RenderError(
+                f"{self.spec.task}: rows of shape (K >= 1, {self.size}) are allowed, got {rows.shape}"
+            )
         rows = rows[_first_episode(self._fields(rows))]
         if not np.isfinite(rows).all():
-            raise RenderError(f"{spec.task}: finite rows are allowed, row {_first_bad(rows)} is not")
-        self.rows = np.ascontiguousarray(rows, np.float64)
-        self.field = self._fields(self.rows)
-        self.time = self.field["elapsed"][:, 0] * spec.control_step
+            raise RenderError(f"{self.spec.task}: finite rows are allowed, row {_first_bad(rows)} is not")
+        self._hold(np.array(rows, np.float64), self._places(rows))
+
+    def append(self, row: Float[np.ndarray, "R"]) -> None:
+        """Add the row of the next control step; a row of another episode takes the place of all."""
+        rows = np.concatenate([self.rows, row[None]])
+        if len(rows[_first_episode(self._fields(rows))]) < len(rows):
+            self.load(row[None])
+        else:
+            self._hold(rows, np.concatenate([self.body_position, self._places(row[None])]))
+
+    def _hold(self, rows: np.ndarray, places: np.ndarray) -> None:
+        """Keep rows, and forget what was derived from others."""
+        self.rows, self.body_position = rows, places
+        self.field = self._fields(rows)
+        self.time = self.field["elapsed"][:, 0] * self.spec.control_step
+        for name in ("lifetime", "acceleration"):
+            self.__dict__.pop(name, None)
 
     @property
     def num_agents(self) -> int:
@@ -101,15 +127,13 @@ class Footage:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
-    @functools.cached_property
-    def body_position(self) -> Float[np.ndarray, "K nbody 3"]:
-        """Where every body was at each row, m."""
-        places = np.empty((len(self.rows), self.model.nbody, 3))
-        data = mujoco.MjData(self.model)  # what is shown stays as it is
-        for place, row in zip(places, self.rows, strict=True):
-            mujoco.mj_setState(self.model, data, row, _STATE.mjSTATE_INTEGRATION)
-            mujoco.mj_kinematics(self.model, data)
-            place[:] = data.xpos
+    def _places(self, rows: np.ndarray) -> Float[np.ndarray, "K nbody 3"]:
+        """Where every body is in each row, m."""
+        places = np.empty((len(rows), self.model.nbody, 3))
+        for place, row in zip(places, rows, strict=True):
+            mujoco.mj_setState(self.model, self._scratch, row, _STATE.mjSTATE_INTEGRATION)
+            mujoco.mj_kinematics(self.model, self._scratch)
+            place[:] = self._scratch.xpos
         return places
 
     def body(self, name: str) -> int:

@@ -34,6 +34,7 @@ class Stage:
         footage: its rows.
         cast: its agents.
         legend: what the colours mean, one line.
+        travels: whether the team leaves the place where it began.
     """
 
     def __init__(self, footage: Footage) -> None:
@@ -49,6 +50,7 @@ class Stage:
         self.cast = Cast(footage)
         self._look = LOOKS[family](footage, self.cast)
         self.legend = self._look.legend
+        self.travels = self._look.travels
         # shadows are computed within a square around the camera's target
         footage.model.vis.map.shadowclip = self._look.reach / footage.model.stat.extent
 

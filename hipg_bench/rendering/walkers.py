@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from hipg_bench.rendering import palette
@@ -22,14 +24,13 @@ class Carrying:
 
     legend = "carry the plank forward  ·  who falls stays down"
     body_size = 0.16
+    travels = True
 
     def __init__(self, footage: Footage, cast: Cast) -> None:
         self._footage = footage
         self._cast = cast
         self.reach = 0.6 * footage.num_agents + 3.0
         self._plank = footage.body("plank/plank")
-        self._start = footage.body_position[0, self._plank].copy()
-        self._way = follow(footage.time, footage.body_position[:, self._plank], _SMOOTHING)
 
     def dress(self, time: float) -> None:
         """Walkers need no more than their hues."""
@@ -61,6 +62,16 @@ class Carrying:
         reach = 0.6 * self._footage.num_agents + 0.55
         distance = 0.63 * reach / np.tan(np.radians(FIELD_OF_VIEW) / 2)
         return Camera(np.array([x + 0.15, 0.6 * y, 0.50]), distance, 74.0, -14.0)
+
+    @property
+    def _start(self) -> np.ndarray:
+        """Where the plank was in the first row, m."""
+        return self._footage.body_position[0, self._plank]
+
+    @functools.cached_property
+    def _way(self) -> np.ndarray:
+        """The plank's way (K, 3) without its jitter; for films only, whose footage does not change."""
+        return follow(self._footage.time, self._footage.body_position[:, self._plank], _SMOOTHING)
 
     def _draw_mark(self, brush: Brush, mark: int) -> None:
         x, strong = float(self._start[0]) + mark, mark % 5 == 0
