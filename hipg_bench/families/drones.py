@@ -63,7 +63,7 @@ def drone_scene(spec: TaskSpec, params: DroneParams) -> mujoco.MjSpec:
         ):
             joint = drone.joint(name)
             joint.range = np.array(limits)
-            joint.damping = np.full_like(joint.damping, params.drag)
+            joint.damping[0] = params.drag  # the other entries are higher powers of speed
         drone.geom("hull").size[0] = params.drone_radius
         for motor in drone.actuators:
             motor.group = i
