@@ -6,13 +6,11 @@ Modules of this package import nothing heavy at their top, so that ``--help`` an
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import sys
 
 import typer
 
-from hipg_bench.cli import agents, bench, calibrate, evaluate, tasks
+from hipg_bench.cli import agents, bench, calibrate, doctor, evaluate, media, tasks, train
 from hipg_bench.errors import HipgError
 
 app = typer.Typer(
@@ -22,14 +20,14 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
 )
 app.command()(evaluate.evaluate)
+app.command()(train.train)
+app.command()(media.video)
+app.command()(media.view)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
 app.command()(calibrate.calibrate)
 app.command()(bench.bench)
-for _module, _names in {"train": ("train",), "media": ("video", "view"), "doctor": ("doctor",)}.items():
-    if importlib.util.find_spec(f"hipg_bench.cli.{_module}"):
-        for _name in _names:
-            app.command()(getattr(importlib.import_module(f"hipg_bench.cli.{_module}"), _name))
+app.command()(doctor.doctor)
 
 
 def main() -> None:

@@ -48,6 +48,9 @@ def show(
     for name in ("builtin", "kind", "authors", "license", "link"):
         if facts[name]:
             console.out.print(f"{name}: {facts[name]}", markup=False)
+    if not facts["tasks"]:
+        console.say("it has no policies yet")
+        return
     rows = console.table("\ntask", "\ntraining seeds", "\npolicy", "\ntrained by")
     for task in facts["tasks"]:
         seeds = ", ".join(str(seed) for seed in task["train_seeds"])

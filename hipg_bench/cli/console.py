@@ -32,13 +32,13 @@ def progress() -> Progress:
 
 
 def table(*columns: str, title: str | None = None) -> Table:
-    """A plain table; a column whose name starts with ``>`` is aligned to the right."""
+    """A plain table; ``>`` before a column's name aligns it to the right, and only the last one wraps."""
     made = Table(
-        title=title, title_justify="left", box=None, pad_edge=False, header_style="bold", padding=(0, 3, 0, 0)
+        title=title, title_justify="left", box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0)
     )
-    for column in columns:
+    for k, column in enumerate(columns, start=1):
         right = column.startswith(">")
-        made.add_column(column.lstrip(">"), justify="right" if right else "left", no_wrap=right)
+        made.add_column(column.lstrip(">"), justify="right" if right else "left", no_wrap=k < len(columns))
     return made
 
 

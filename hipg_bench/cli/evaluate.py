@@ -82,16 +82,15 @@ def suite_of(tasks: str) -> Suite:
 def _print(results: dict[str, Any], folder: Path) -> None:
     """The table at the end."""
     number, interval = console.number, console.interval
-    rows = console.table("task", ">score", "", ">return", "", ">survival", ">deaths", "ended by")
+    rows = console.table("task", ">score", "", ">return", ">survival", ">deaths", "ended by")
     for task in results["tasks"]:
         rows.add_row(
             task["task"], number(task["score"]), interval(task["score_ci95"]),
-            number(task["return_mean"], 1), interval(task["return_ci95"], 1),
-            f"{100 * task['survival']:.0f} %", number(task["deaths"]),
+            number(task["return_mean"], 1), f"{100 * task['survival']:.0f} %", number(task["deaths"]),
             ", ".join(f"{reason} {count}" for reason, count in task["end_reasons"].items()),
         )  # fmt: skip
     for task in results["skipped"]:
-        rows.add_row(task["task"], "-", f"[dim]{task['reason']}[/dim]")
+        rows.add_row(task["task"], "-", "", "-", "-", "-", f"[dim]{task['reason']}[/dim]")
     console.say(f"[bold]{results['agent']}[/bold] on {results['suite']}: {results['agent_summary']}\n")
     console.show(rows)
     whole = results["aggregate"]
