@@ -195,7 +195,9 @@ class Footage:
             rate = self._part("QVEL")
             slope, later = (rate[row, index.scalar_velocity] * step for row in (before, after))
             a, b = start[index.scalar], end[index.scalar]
-            place[index.scalar] = np.clip(_hermite(a, b, slope, later, share), index.low, index.high)
+            # limits are soft: rows may lie beyond them, curves must not go further
+            low, high = np.minimum(index.low, np.minimum(a, b)), np.maximum(index.high, np.maximum(a, b))
+            place[index.scalar] = np.clip(_hermite(a, b, slope, later, share), low, high)
         for quaternion in index.quaternion:
             place[quaternion] = _turned(start[quaternion][None], end[quaternion][None], share)[0]
         return place
@@ -206,9 +208,9 @@ class Footage:
         scalar = np.isin(model.jnt_type, (int(kind.mjJNT_SLIDE), int(kind.mjJNT_HINGE)))
         limited = model.jnt_limited[scalar] > 0
         starts = [
-            int(address) + (3 if joint == kind.mjJNT_FREE else 0)
-            for address, joint in zip(model.jnt_qposadr, model.jnt_type, strict=True)
-            if joint in (kind.mjJNT_FREE, kind.mjJNT_BALL)
+            address + (3 if joint == int(kind.mjJNT_FREE) else 0)
+            for address, joint in zip(model.jnt_qposadr.tolist(), model.jnt_type.tolist(), strict=True)
+            if joint in (int(kind.mjJNT_FREE), int(kind.mjJNT_BALL))
         ]
         return _Joints(
             scalar=model.jnt_qposadr[scalar],

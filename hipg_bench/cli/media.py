@@ -1,0 +1,94 @@
+"""``hipg-bench video`` and ``hipg-bench view``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hipg_bench.cli import console
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from hipg_bench.env import BatchEnv
+    from hipg_bench.policies.policy import Policy
+
+AgentOption = Annotated[str, typer.Option(help="A bundled agent's name, or the path of a bundle.")]
+TaskOption = Annotated[str, typer.Option(help="The task's name.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Evaluation seed.")]
+EpisodeOption = Annotated[int, typer.Option(min=0, help="World of an evaluation with that seed.")]
+TrainSeedOption = Annotated[int, typer.Option(min=0, help="Which of the agent's trainings.")]
+
+
+def video(
+    task: TaskOption,
+    agent: AgentOption = "mappo_minhealth",
+    episode: EpisodeOption = 0,
+    seed: SeedOption = 0,
+    train_seed: TrainSeedOption = 0,
+    out: Annotated[Path | None, typer.Option(help="File, .mp4 or .gif.")] = None,
+    width: Annotated[int, typer.Option(min=64, help="Pixels.")] = 1280,
+    height: Annotated[int, typer.Option(min=64, help="Pixels.")] = 720,
+    fps: Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")] = 30,
+) -> None:
+    """Play one episode and film it."""
+    from hipg_bench import registry
+    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.policies.bundle import load_agent
+    from hipg_bench.rendering import film
+
+    who, spec = load_agent(agent), registry.task_spec(task)
+    policy = who.policy(spec, train_seed)
+    path = out or Path("runs") / f"{task}-{who.name}-{seed}-{episode}.mp4"
+    plan = Plan(seed=seed, episodes=episode + 1, threads=1)
+    with console.progress() as bars:
+        bar = bars.add_task(f"play {task}", total=1.0)
+        row = plan.play(spec, policy, [episode], lambda done: bars.advance(bar, done))[0]
+        states = plan.record(spec, policy, row)
+        bar = bars.add_task("film", total=None)
+        film.record(
+            spec, states, path, agent=who.name, size=(width, height), fps=fps, end_reason=row["end_reason"],
+            progress=lambda done, total: bars.update(bar, completed=done, total=total),
+        )  # fmt: skip
+    console.say(f"{path}: return {row['return']:.2f}, {row['deaths']} dead, {row['end_reason']}")
+
+
+def view(
+    task: TaskOption,
+    agent: AgentOption = "mappo_minhealth",
+    episode: EpisodeOption = 0,
+    seed: SeedOption = 0,
+    train_seed: TrainSeedOption = 0,
+    speed: Annotated[float, typer.Option(min=0.05, max=20.0, help="Times real time.")] = 1.0,
+) -> None:
+    """Watch an agent play in an interactive window, episode after episode."""
+    from hipg_bench import registry
+    from hipg_bench.policies.bundle import load_agent
+    from hipg_bench.rendering import viewer
+
+    viewer.check_display()
+    who, spec = load_agent(agent), registry.task_spec(task)
+    env = registry.make(spec, 1, seed, threads=1)
+    viewer.watch(spec, _rows(env, who.policy(spec, train_seed), seed, episode), speed=speed)
+
+
+def _rows(env: BatchEnv, policy: Policy, seed: int, episode: int) -> Iterator[np.ndarray]:
+    """State rows of one episode after another, without end."""
+    import numpy as np
+
+    while True:
+        ids = np.array([episode])
+        step = env.reset(ids)
+        memory = policy.initial_state(seed, ids, env.num_agents)
+        yield env.rows[0]
+        over = False
+        while not over:
+            seen = step.info["state"] if policy.privileged else step.observation
+            action, memory = policy.act(seen, memory, step.info["alive"])
+            step = env.step(action)
+            over = bool(step.terminated[0] or step.truncated[0])
+            yield step.info["final_rows"][0] if over else env.rows[0]
+        episode += 1

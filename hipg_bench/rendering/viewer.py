@@ -1,0 +1,99 @@
+"""Watching a team play, in MuJoCo's interactive viewer, dressed as in films."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+
+import mujoco
+import mujoco.viewer
+import numpy as np
+from jaxtyping import Float
+
+from hipg_bench.errors import RenderError
+from hipg_bench.rendering.motion import Footage
+from hipg_bench.rendering.scene import Stage
+from hipg_bench.spec import TaskSpec
+
+_FRAME = 1 / 60
+"""Seconds between pictures."""
+_PAUSE = 1.0
+"""Seconds for which the end of an episode stays in view."""
+
+
+def check_display() -> None:
+    """Say what to do where no window can be opened.
+
+    Raises:
+        RenderError: there is no display.
+    """
+    needs_x = sys.platform.startswith("linux")
+    if needs_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderError(
+            "the viewer opens a window, and there is no display (DISPLAY is not set): run it on a desktop "
+            "or through `ssh -X`, or make a film instead with `hipg-bench video`"
+        )
+
+
+def watch(spec: TaskSpec, rows: Iterator[Float[np.ndarray, "R"]], *, speed: float = 1.0) -> None:
+    """Show episodes as they are played, until the window is closed or the rows end.
+
+    The picture lags one control step behind the play, so that it can move between rows.
+
+    Args:
+        spec: the task.
+        rows: the start of an episode, then its control steps, then the next episode.
+        speed: seconds of the world per second.
+
+    Raises:
+        RenderError: no display, or no look for the task's family.
+    """
+    check_display()
+    footage = Footage(spec, next(rows)[None])
+    stage = Stage(footage)
+    stage.dress(0.0)
+    with mujoco.viewer.launch_passive(
+        footage.model, footage.data, show_left_ui=False, show_right_ui=False
+    ) as window:
+        camera = stage.camera(0.0)
+        window.cam.lookat[:] = camera.target
+        window.cam.distance, window.cam.azimuth = camera.distance, camera.azimuth
+        window.cam.elevation = camera.elevation
+        due = time.monotonic()
+        for row in rows:
+            footage.append(row)
+            if len(footage.rows) == 1:
+                due += _PAUSE
+                continue
+            start, end = (float(moment) for moment in footage.time[-2:])
+            pictures = max(1, round((end - start) / speed / _FRAME))
+            for k in range(1, pictures + 1):
+                if not window.is_running():
+                    return
+                _draw(window, stage, start + (end - start) * k / pictures)
+                due += (end - start) / speed / pictures
+                time.sleep(max(0.0, due - time.monotonic()))
+            due = max(due, time.monotonic() - 2 * _FRAME)  # a slow machine plays slowly, it never skips
+
+
+def _draw(window: mujoco.viewer.Handle, stage: Stage, moment: float) -> None:
+    with window.lock():
+        before = stage.cast.middle
+        stage.dress(moment)
+        if stage.travels:
+            window.cam.lookat[:2] += (stage.cast.middle - before)[:2]
+        scene = window.user_scn
+        scene.ngeom = 0
+        _, status = stage.decorate(scene, moment)
+    now = stage.footage.remembered(moment)
+    alive = int((now["health"] > 0).sum())
+    words = {
+        "time": f"{moment:.1f} s",
+        "return": f"{float(now['return'][0]):.1f}",
+        "alive": f"{alive} of {stage.footage.num_agents}",
+        **{line.text: "" for line in status},
+    }
+    window.set_texts((None, None, "\n".join(words), "\n".join(words.values())))
+    window.sync()
