@@ -1,6 +1,7 @@
 """Films: what is in them, that they are whole or absent, and that motion between rows is the physics'."""
 
 import colorsys
+import itertools
 import os
 import signal
 import subprocess
@@ -140,7 +141,8 @@ def test_a_killed_recording_leaves_nothing_behind(navigation, tmp_path, how):
     out = tmp_path / "films" / "a.mp4"
     code = (
         "import sys, numpy as np; from pathlib import Path; from hipg_bench.rendering import film\n"
-        "film.record('hazard_nav-4', np.load(sys.argv[1]), Path(sys.argv[2]), agent='a', size=(640, 360), fps=120)"
+        "film.record('hazard_nav-4', np.load(sys.argv[1]), Path(sys.argv[2]), agent='a', size=(640, 360), "
+        "fps=120)"
     )
     parent = subprocess.Popen(
         [sys.executable, "-c", code, str(tmp_path / "rows.npy"), str(out)],
@@ -312,7 +314,7 @@ def test_the_chain_drawn_is_a_shortest_one(nodes, share, seed):
         chain = drones._chain(links)
         assert len(chain) == hops + 1
         assert (chain[0], chain[-1]) == (0, 1)
-        assert all(links[a, b] for a, b in zip(chain, chain[1:], strict=False))
+        assert all(links[a, b] for a, b in itertools.pairwise(chain))
 
 
 @pytest.mark.parametrize("num_agents", [2, 4, 10, 16, 31])
