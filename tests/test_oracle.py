@@ -204,3 +204,21 @@ def test_deaths_do_not_depend_on_who_else_is_there():
     assert same(first[0], first[1])
     play(env, env.reset(np.array([5, 6])), 3)
     assert same(env.recall(env.rows, "toughness")[0].copy(), first[0])
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_the_dead_reveal_nothing(alive: bool):
+    """Agent 0 is put on the hazard, all others out of its reach, and agent 0 may be dead already."""
+    env = make("hazard_nav-4", 1, threads=1)
+    env.reset()
+    (hazard,) = np.flatnonzero(env.recall(env.rows, "hazardous")[0])
+    place = env._sim.position.reshape(4, 3)
+    centre = env._sim.marker[0, hazard]
+    corners = np.array([[x, y, 0.1] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    far = corners[np.argsort(-np.linalg.norm(corners - centre, axis=1))]
+    place[0], place[1:] = centre, far[:3]
+    env.load_rows(np.array([0]), env.fork(env.rows, {} if alive else {0: 0.0}))
+    assert env.recall(env.rows, "revealed").sum() == 0
+    env.step(np.zeros((1, 4, 3)))
+    assert env.recall(env.rows, "revealed")[0, hazard] == alive
+    assert env.recall(env.rows, "revealed").sum() == alive
