@@ -143,7 +143,8 @@ class MultiWalker:
 
         ``progress``: the plank's way along x, m, at most the capped speed's; ``fall``: share of the team that
         fell in it; ``drop``: 1 where the plank is lost: on the ground, or with nobody left under it;
-        ``effort``, ``jerk``: mean square of the actions and of their change.
+        ``effort``, ``jerk``: mean square of the actions and of their change; ``alive``: share of the team on
+        its feet, which the tasks do not pay for but training may (standing still must earn nothing).
         """
         moved = now.pose.position[:, -1, 0] - was.pose.position[:, -1, 0]
         fell = (was.health > 0) & (now.health == 0)
@@ -153,6 +154,7 @@ class MultiWalker:
             "drop": self.terminated(now)[0].astype(np.float64),
             "effort": np.square(now.action).mean(axis=(1, 2)),
             "jerk": np.square(now.action - was.action).mean(axis=(1, 2)),
+            "alive": (now.health > 0).mean(axis=1),
         }
 
     def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], np.ndarray]:

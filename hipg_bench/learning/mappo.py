@@ -58,7 +58,11 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.env: BatchEnv = make(
-            settings.task, settings.num_envs, settings.seed, threads=torch.get_num_threads()
+            settings.task,
+            settings.num_envs,
+            settings.seed,
+            threads=torch.get_num_threads(),
+            weights=settings.weights,
         )
         layout = self.env.layout
         self.actor = Actor(
