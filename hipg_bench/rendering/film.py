@@ -41,9 +41,8 @@ _STALL = 120.0
 _ENDS = {
     "horizon": "time is up",
     "physics": "the physics diverged",
-    "drop": "the plank was dropped",
     "dropped": "the plank was dropped",
-    "fallen": "everyone has fallen",
+    "all_fallen": "everyone has fallen",
 }
 """End reasons in plain words; others are shown as they are."""
 

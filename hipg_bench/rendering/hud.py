@@ -118,13 +118,13 @@ class Hud:
     ) -> Image.Image:
         """The last frame, veiled, with what came of the episode; ``share`` in [0, 1] fades it in."""
         width, height = self._size
-        veil = Image.new("RGBA", self._size, (6, 9, 15, round(150 * share)))
+        veil = Image.new("RGBA", self._size, (6, 9, 15, round(95 * share)))
         draw = ImageDraw.Draw(veil)
         tall = self._px(96 + 30 * len(lines))
         wide = self._px(460)
         left, top = (width - wide) // 2, (height - tall) // 2
         radius = self._px(14)
-        draw.rounded_rectangle((left, top, left + wide, top + tall), radius, (14, 19, 30, round(225 * share)))
+        draw.rounded_rectangle((left, top, left + wide, top + tall), radius, (12, 16, 26, round(238 * share)))
         middle = width // 2
         draw.text(
             (middle, top + self._px(48)), headline, _ink(WHITE, share), self._font(27, bold=True), anchor="mm"
