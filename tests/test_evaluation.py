@@ -362,6 +362,6 @@ def test_bench_counts_env_steps():
     rate = bench.measure(task_spec(TASK), 8, threads=1, seconds=0.2)
     assert (rate.task, rate.num_envs, rate.threads) == (TASK, 8, 1)
     assert rate.env > 100
-    # the environment runs the same physics and more beside it; a tenth for the clock's noise
-    assert 0 < rate.share < 1.1
-    assert rate.share == pytest.approx(rate.env / rate.raw, rel=0.5)
+    # eight worlds of four drones: Python takes most of a step, so the physics alone is several times faster
+    assert 0 < rate.share < 0.8
+    assert rate.raw > rate.env
