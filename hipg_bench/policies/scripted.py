@@ -19,10 +19,10 @@ from hipg_bench.spec import TaskSpec
 
 _CLEARANCE = 0.04
 """How far outside a hazard's radius the aware expert stays, m."""
-_STIFFNESS, _DAMPING = 6.0, 1.33
-"""Thrust per m to go, and per m/s of speed: critically damped for 6 N of thrust and 4 N s/m of drag."""
+_DRONE, _PARTICLE = (6.0, 1.33), (50.0, 7.5)
+"""Action per m to go, and per m/s of speed; a drone (6 N of thrust, 4 N s/m of drag) is critically damped."""
 
-Places = Float[np.ndarray, "B N 3"]
+Places = Float[np.ndarray, "B N D"]  # D is 3 for drones, 2 for the paper's particles
 
 
 class Scripted:
@@ -56,8 +56,12 @@ class Scripted:
         self, state: Float[np.ndarray, "B S"], memory: None, alive: Bool[np.ndarray, "B N"]
     ) -> tuple[Float[np.ndarray, "B N A"], None]:
         """Fly every live drone towards its place in the plan."""
-        plan = _PLANS[self._spec.family]
-        return plan(self._spec, self._layout, state.astype(np.float64), alive, self._blind), memory
+        plan, (stiffness, damping) = _PLANS[self._spec.family]
+        state = state.astype(np.float64)
+        target = plan(self._spec, self._layout, state, alive, self._blind)
+        position = self._layout.state.view(state, "position")
+        velocity = self._layout.state.view(state, "velocity")
+        return np.clip(stiffness * (target - position) - damping * velocity, -1.0, 1.0), memory
 
 
 def _navigate(
@@ -66,19 +70,20 @@ def _navigate(
     state: Float[np.ndarray, "B S"],
     alive: Bool[np.ndarray, "B N"],
     blind: bool,
-) -> Float[np.ndarray, "B N A"]:
-    """Cover every point; watch hazardous ones from their edge."""
+) -> Places:
+    """Cover every point, hazardous ones from their edge; in the paper's task those earn nothing."""
     position = layout.state.view(state, "position")
-    velocity = layout.state.view(state, "velocity")
     point = layout.state.view(state, "point_position")
     hazardous = layout.state.view(state, "point_hazardous") > 0
     if blind:
-        return _fly(position, velocity, _assign(position, point, alive))
+        return _assign(position, point, alive)
     margin = spec.params["hazard_radius"] + _CLEARANCE
     # hazards that do not exist are put where nobody passes
     hazard = np.where(hazardous[..., None], point, 1e3)
+    if spec.family == "paper_nav":
+        point = np.where(hazardous[..., None], np.nan, point)
     target = _outside(_assign(position, point, alive), hazard, margin, towards=position)
-    return _fly(position, velocity, _around(position, target, hazard, margin))
+    return _around(position, target, hazard, margin)
 
 
 def _relay(
@@ -87,10 +92,9 @@ def _relay(
     state: Float[np.ndarray, "B S"],
     alive: Bool[np.ndarray, "B N"],
     blind: bool,
-) -> Float[np.ndarray, "B N A"]:
+) -> Places:
     """Form an evenly spaced chain between the terminals: straight if blind, else around the hazard."""
     position = layout.state.view(state, "position")
-    velocity = layout.state.view(state, "velocity")
     terminal = layout.state.view(state, "terminal_position")
     hazard = layout.state.view(state, "hazard_position")
     margin = spec.params["hazard_radius"] + _CLEARANCE
@@ -98,23 +102,19 @@ def _relay(
     # a spare drone or two near each relay keeps the chain whole when one is lost on the way
     chain = _along(terminal, bend, alive)
     target = _assign(position, chain, alive)
-    if not blind:
-        target = _around(position, target, hazard[:, None], margin)
-    return _fly(position, velocity, target)
+    return target if blind else _around(position, target, hazard[:, None], margin)
 
 
-_PLANS: Mapping[str, Callable[..., Float[np.ndarray, "B N A"]]] = {
-    "hazard_nav": _navigate,
-    "hazard_comm": _relay,
+_PLANS: Mapping[str, tuple[Callable[..., Places], tuple[float, float]]] = {
+    "hazard_nav": (_navigate, _DRONE),
+    "hazard_comm": (_relay, _DRONE),
+    "paper_nav": (_navigate, _PARTICLE),
+    "paper_comm": (_relay, _PARTICLE),
 }
+"""Where a family's agents are to go, and how its bodies are steered there."""
 
 
-def _fly(position: Places, velocity: Places, target: Places) -> Places:
-    """Thrust towards a target, braking in time."""
-    return np.clip(_STIFFNESS * (target - position) - _DAMPING * velocity, -1.0, 1.0)
-
-
-def _assign(position: Places, target: Float[np.ndarray, "B P 3"], alive: Bool[np.ndarray, "B N"]) -> Places:
+def _assign(position: Places, target: Float[np.ndarray, "B P D"], alive: Bool[np.ndarray, "B N"]) -> Places:
     """Give each live drone a target, at the least total distance; the others stay where they are."""
     assigned = position.copy()
     cost = np.linalg.norm(position[:, :, None] - target[:, None], axis=-1)
@@ -126,7 +126,7 @@ def _assign(position: Places, target: Float[np.ndarray, "B P 3"], alive: Bool[np
     return assigned
 
 
-def _outside(target: Places, hazard: Float[np.ndarray, "B P 3"], margin: float, towards: Places) -> Places:
+def _outside(target: Places, hazard: Float[np.ndarray, "B P D"], margin: float, towards: Places) -> Places:
     """Move targets that lie in a hazard to its edge, on the side of the drone that is to go there."""
     for k in range(hazard.shape[1]):
         centre = hazard[:, k, None]
@@ -137,7 +137,7 @@ def _outside(target: Places, hazard: Float[np.ndarray, "B P 3"], margin: float, 
     return target
 
 
-def _around(position: Places, target: Places, hazard: Float[np.ndarray, "B P 3"], margin: float) -> Places:
+def _around(position: Places, target: Places, hazard: Float[np.ndarray, "B P D"], margin: float) -> Places:
     """Replace targets behind a hazard by a waypoint beside it; whoever is inside one leaves it first."""
     aim = target
     for k in range(hazard.shape[1]):
@@ -158,12 +158,13 @@ def _around(position: Places, target: Places, hazard: Float[np.ndarray, "B P 3"]
 
 
 def _bend(
-    terminal: Float[np.ndarray, "B 2 3"], hazard: Float[np.ndarray, "B 3"], margin: float
-) -> Float[np.ndarray, "B 3"]:
+    terminal: Float[np.ndarray, "B 2 D"], hazard: Float[np.ndarray, "B D"], margin: float
+) -> Float[np.ndarray, "B D"]:
     """The corner of the shortest two-legged horizontal path between the terminals that clears the hazard."""
     line = terminal[:, 1] - terminal[:, 0]
     line = line / np.linalg.norm(line, axis=-1, keepdims=True)
-    side = np.stack([-line[:, 1], line[:, 0], np.zeros(len(line))], axis=-1)
+    side = np.zeros_like(line)
+    side[:, 0], side[:, 1] = -line[:, 1], line[:, 0]
     middle = terminal.mean(axis=1)
     off = hazard - middle
     # bend to the side the hazard is not on
@@ -180,7 +181,7 @@ def _bend(
 
 
 def _gap_to_leg(
-    start: Float[np.ndarray, "B 3"], end: Float[np.ndarray, "B 3"], point: Float[np.ndarray, "B 3"]
+    start: Float[np.ndarray, "B D"], end: Float[np.ndarray, "B D"], point: Float[np.ndarray, "B D"]
 ) -> Float[np.ndarray, "B"]:
     """Distance from a point to the segment start-end."""
     leg = end - start
@@ -189,8 +190,8 @@ def _gap_to_leg(
 
 
 def _along(
-    terminal: Float[np.ndarray, "B 2 3"], bend: Float[np.ndarray, "B 3"], alive: Bool[np.ndarray, "B N"]
-) -> Float[np.ndarray, "B N 3"]:
+    terminal: Float[np.ndarray, "B 2 D"], bend: Float[np.ndarray, "B D"], alive: Bool[np.ndarray, "B N"]
+) -> Float[np.ndarray, "B N D"]:
     """Evenly spaced relay places on the path terminal-bend-terminal, one per live drone; NaN beyond."""
     first = np.linalg.norm(bend - terminal[:, 0], axis=-1)[:, None]
     second = np.linalg.norm(terminal[:, 1] - bend, axis=-1)[:, None]
