@@ -160,7 +160,8 @@ class BatchEnv:
         terminated = ruled | diverged
         truncated = ~terminated & (field["elapsed"][:, 0] >= self.spec.horizon)
         terms = self._pay_floor(terms, diverged)
-        reward = np.sum(list(terms.values()), axis=0)
+        # one after another: NumPy may pair the summands by the number of worlds, which changes last bits
+        reward = sum(terms.values(), np.zeros(self.num_envs))
         field["return"][:, 0] += reward
         end_reason = np.select([diverged, ruled, truncated], ["physics", reason, "horizon"], "")
 
