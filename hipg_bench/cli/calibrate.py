@@ -48,6 +48,7 @@ def _print(measured: Calibration) -> None:
     anchors, facts = spec.anchors, spec.calibration
     if anchors is None:
         return
+    standard = "standard" in spec.tags  # what is wanted of a task; the paper's are as they are
     console.say(f"[bold]{spec.task}[/bold] v{spec.version} ({spec.fingerprint})\n")
     rows = console.table("what", ">value", "95 %", "wanted", "")
     for name, anchor in (("random", anchors.random), ("reference", anchors.reference)):
@@ -59,7 +60,7 @@ def _print(measured: Calibration) -> None:
             f"score, {name}",
             f"{score:.3f}",
             console.interval(ends, 3),
-            _wanted(score < 0.2, "< 0.2") if probe else "",
+            _wanted(score < 0.2, "< 0.2") if probe and standard else "",
         )
     if "hazard_leverage" in facts:
         leverage = facts["hazard_leverage"]
@@ -67,7 +68,7 @@ def _print(measured: Calibration) -> None:
             "hazard leverage",
             f"{leverage:.3f}",
             "",
-            _wanted(leverage >= 0.25, ">= 0.25"),
+            _wanted(leverage >= 0.25, ">= 0.25") if standard else "",
             "score, hazard off - blind",
         )
         rows.add_row("deaths, blind", f"{facts['blind_deaths']:.3f}", "", "", "per agent and episode")
