@@ -42,7 +42,7 @@ def test_the_hazard_matters(task: str):
 @pytest.mark.parametrize("task", ANCHORED)
 def test_random_play_still_earns_its_anchor(task: str):
     """A fresh sample of random episodes, within 4.5 standard errors: whoever changes a task measures anew."""
-    spec, worlds = task_spec(task), 160
+    spec, worlds = task_spec(task), 96
     assert spec.anchors
     env, rng = make(task, worlds, seed=11, threads=1), np.random.default_rng(3)
     step, total, running = env.reset(), np.zeros(worlds), np.ones(worlds, bool)

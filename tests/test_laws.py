@@ -222,7 +222,7 @@ def constants(spec: TaskSpec) -> dict[str, str]:
 def ravaged(task: str) -> tuple[BatchEnv, list[Step]]:
     """Many short episodes of steady pushes in which anything from nobody to nearly all is killed."""
     walkers = hipg_bench.task_spec(task).family == "multiwalker"
-    worlds, rng = 32 if walkers else 384, np.random.default_rng(0)
+    worlds, rng = 32 if walkers else 256, np.random.default_rng(0)
     env = make(task, worlds, threads=1, horizon=20)
     steps = [env.reset()]
     for t in range(40):
