@@ -53,7 +53,7 @@ class Settings(Params):
     std: float = pydantic.Field(default=0.6, gt=0, le=5)
     actor_hidden: tuple[int, ...] = (128, 128)
     critic_hidden: tuple[int, ...] = (256, 256)
-    weights: dict[str, float] = {}
+    weights: dict[str, float] = pydantic.Field(default_factory=dict[str, float])
 
     @property
     def iterations(self) -> int:
