@@ -95,7 +95,6 @@ class BatchEnv:
             num_envs,
             memory_fields(spec, family),
             decimation=family.physics_steps,
-            derived=family.derived,
             threads=threads,
         )
         self._seed = seed
@@ -208,7 +207,6 @@ class BatchEnv:
         ids, rows = ids[order], rows[order]
         self._sim.reset(ids)
         self._sim.rows[ids] = rows
-        self._sim.refresh(ids)
         self._next_episode = max(self._next_episode, int(self._sim.field["episode_id"].max()) + 1)
         return self._resume()
 
@@ -262,7 +260,6 @@ class BatchEnv:
         field["death_time"][ids] = NEVER
         field["episode_id"][ids, 0] = episodes
         self.family.reset(self._sim, ids, chance[:, n:])
-        self._sim.refresh(ids)
 
     def _resume(self) -> Step:
         """Look at the worlds as they stand."""

@@ -42,7 +42,6 @@ class Sim:
         fields: Mapping[str, int],
         *,
         decimation: int,
-        derived: bool,
         threads: int = 0,
     ) -> None:
         """Allocate the worlds.
@@ -52,22 +51,18 @@ class Sim:
             num_envs: B.
             fields: name to numbers kept per world in ``userdata``.
             decimation: physics steps per control step.
-            derived: whether fields that MuJoCo derives (contacts, body frames) are read; they are
-                then current after every call, at the price of one MjData per world.
             threads: 0 for all cores.
         """
         # a diverged world must keep its row: the environment ends its episode, MuJoCo must not reset it
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.model = model
-        self.batch = Batch(model, num_envs, threads, persistent=derived)
-        self._stage = int(mujoco.mjtStage.mjSTAGE_VEL if derived else mujoco.mjtStage.mjSTAGE_NONE)
+        self.batch = Batch(model, num_envs, threads)
         self._decimation = decimation
         self.control = self.batch.bind("ctrl")
         self.position = self.batch.bind("qpos")
         self.velocity = self.batch.bind("qvel")
         self.applied = self.batch.bind("qfrc_applied")
         self.marker = self.batch.bind("mocap_pos")
-        self.marker_orientation = self.batch.bind("mocap_quat")
         userdata = self.batch.bind("userdata")
         ends = np.cumsum(list(fields.values())).tolist()
         self._columns = {
@@ -87,10 +82,6 @@ class Sim:
         """B."""
         return self.batch.nsim
 
-    def derived(self, name: str) -> np.ndarray:
-        """Live read-only (B, ...) view of a field MuJoCo derives, e.g. ``xpos`` or ``sensordata``."""
-        return self.batch.bind(name)
-
     def disable(self, dead: Bool[np.ndarray, "B N"]) -> None:
         """Cut every actuator of dead agents: their groups exert no force, whatever they are told."""
         self._disabled[:] = dead @ (1 << np.arange(dead.shape[1]))
@@ -102,24 +93,18 @@ class Sim:
             (B,) the worlds whose physics diverged in it; they are put back to the model's default
             pose, so that everything read from them is finite, and must be reset.
         """
-        self.batch.step(nstep=self._decimation, stage=self._stage)
+        self.batch.step(nstep=self._decimation)
         diverged = self.batch.warning[:, _BAD_PHYSICS, 1].any(axis=1)
         if diverged.any():
             self.position[diverged] = self.model.qpos0
             self.velocity[diverged] = 0.0
             self.batch.bind("qacc_warmstart")[diverged] = 0.0
-            self.batch.forward(np.flatnonzero(diverged), self._stage)
         return diverged
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Return worlds to the model's defaults, all agents enabled; userdata becomes 0."""
         self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._disabled[ids] = 0
-
-    def refresh(self, ids: Int[np.ndarray, "n"]) -> None:
-        """Make derived fields current after state was written by hand."""
-        if self._stage:
-            self.batch.forward(ids, self._stage)
 
     @property
     def rows(self) -> Float[np.ndarray, "B R"]:

@@ -50,7 +50,6 @@ class Family(Protocol):
         causes: names of what kills.
         metrics: names of what ``measure`` returns.
         physics_steps: physics steps per control step.
-        derived: whether snapshots read fields that MuJoCo derives.
     """
 
     layout: TaskLayout
@@ -59,7 +58,6 @@ class Family(Protocol):
     causes: tuple[str, ...]
     metrics: tuple[str, ...]
     physics_steps: int
-    derived: bool
 
     def scene(self) -> mujoco.MjSpec:
         """Compose the world, agent i's actuators in group i, what only a camera sees in `VISUAL_GROUP`."""

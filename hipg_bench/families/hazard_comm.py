@@ -67,7 +67,6 @@ class HazardComm:
 
     causes: tuple[str, ...] = ("hazard",)
     metrics: tuple[str, ...] = ("connected", "first_link", "chain")
-    derived: bool = False
 
     def __init__(self, spec: TaskSpec) -> None:
         self.spec = spec

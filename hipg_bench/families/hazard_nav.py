@@ -66,7 +66,6 @@ class HazardNav:
 
     causes: tuple[str, ...] = ("hazard",)
     metrics: tuple[str, ...] = ("covered", "collisions", "revealed")
-    derived: bool = False
 
     def __init__(self, spec: TaskSpec) -> None:
         self.spec = spec

@@ -74,7 +74,6 @@ class MultiWalker:
 
     causes: tuple[str, ...] = ("tipped", "sunk")
     metrics: tuple[str, ...] = ("displacement", "slip", "carriers", "tipped", "sunk", "dropped")
-    derived = False
 
     def __init__(self, spec: TaskSpec) -> None:
         self.spec = spec

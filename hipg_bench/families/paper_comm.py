@@ -68,7 +68,6 @@ class PaperComm:
 
     causes: tuple[str, ...] = particles.CAUSES
     metrics: tuple[str, ...] = ("connected", "collisions", *particles.DEATH_METRICS)
-    derived: bool = False
     physics_steps: int = 1
 
     def __init__(self, spec: TaskSpec) -> None:

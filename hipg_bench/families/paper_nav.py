@@ -64,7 +64,6 @@ class PaperNav:
 
     causes: tuple[str, ...] = particles.CAUSES
     metrics: tuple[str, ...] = ("covered", "collisions", *particles.DEATH_METRICS)
-    derived: bool = False
     physics_steps: int = 1
 
     def __init__(self, spec: TaskSpec) -> None:
