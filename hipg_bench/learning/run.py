@@ -19,6 +19,7 @@ from hipg_bench.learning.mappo import Trainer
 from hipg_bench.learning.settings import Settings
 from hipg_bench.paths import write_text
 from hipg_bench.policies.network import save_network
+from hipg_bench.registry import task_spec
 
 _SAVE_EVERY = 10
 """Iterations between checkpoints; a kill loses fewer."""
@@ -85,7 +86,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 def _record(trainer: Trainer, command: str, steps: int, seconds: float) -> str:
     """Everything a model card needs to know about where the weights came from."""
-    spec = trainer.env.spec
+    spec = task_spec(trainer.settings.task)  # as it is scored, without the weights of training
     content = {
         "command": command,
         "task": spec.task,
