@@ -2,7 +2,7 @@
 #   make evaluate AGENT=random ARGS="--quick"
 #   make test ARGS="-k laws"
 .DEFAULT_GOAL := help
-.PHONY: help setup evaluate test test-slow lint format bench golden clean
+.PHONY: help setup evaluate test lint format bench golden clean
 
 BIN := .venv/bin
 READY := .venv/.ready
@@ -21,10 +21,7 @@ evaluate: $(READY) ## score an agent on the standard suite, with films
 	$(BIN)/hipg-bench evaluate --agent $(AGENT) $(ARGS)
 
 test: $(READY) ## the tests, some minutes
-	$(BIN)/pytest -m "not slow" $(ARGS)
-
-test-slow: $(READY) ## parity and calibration over thousands of episodes, long
-	$(BIN)/pytest -m slow $(ARGS)
+	$(BIN)/pytest $(ARGS)
 
 lint: $(READY) ## style, types, layers, spelling
 	$(BIN)/ruff check .
