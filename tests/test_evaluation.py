@@ -173,7 +173,7 @@ def test_a_folder_of_another_evaluation_is_refused(tmp_path):
     rows = (tmp_path / f"episodes/{TASK}.jsonl").read_bytes()
     with pytest.raises(ResumeError, match="agent is 'zero' there and 'random' here"):
         runner.evaluate(load_agent("random"), suite(TASK), tmp_path, plan)
-    with pytest.raises(ResumeError, match="seed is 0 there and 1 here"):
+    with pytest.raises(ResumeError, match="seed is 1000 there and 1 here"):
         runner.evaluate(zero, suite(TASK), tmp_path, dataclasses.replace(plan, seed=1))
     with pytest.raises(ResumeError, match="world is 3 there and 'below 3' here"):
         runner.evaluate(zero, suite(TASK), tmp_path, dataclasses.replace(plan, episodes=3))

@@ -173,7 +173,9 @@ def test_another_runs_folder_is_refused(tmp_path: Path) -> None:
         train(recommended("hazard_nav-4", **SMALL, gamma=0.5), tmp_path, command="test")
 
 
-@pytest.mark.parametrize(("field", "value"), [("gamma", 1.5), ("arm", "min-health"), ("steps", 0)])
+@pytest.mark.parametrize(
+    ("field", "value"), [("gamma", 1.5), ("arm", "min-health"), ("steps", 0), ("seed", 1000)]
+)
 def test_settings_out_of_range_are_refused(field: str, value: object) -> None:
     with pytest.raises(SpecError, match=field):
         recommended("hazard_nav-4", **{field: value})

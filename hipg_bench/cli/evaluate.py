@@ -24,7 +24,7 @@ def evaluate(
         str, typer.Option(help="Task names with commas between, or: standard, paper, all.")
     ] = "standard",
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and training seed.")] = 320,
-    seed: Annotated[int, typer.Option(min=0, help="Evaluation seed of the first 64 worlds.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Evaluation seed of the first 64 worlds.")] = 1000,
     num_envs: Annotated[
         int, typer.Option(min=1, help="Worlds at a time, at most 64; no result depends on it.")
     ] = 64,

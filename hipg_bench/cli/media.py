@@ -27,7 +27,7 @@ def video(
     task: TaskOption,
     agent: AgentOption = "mappo_minhealth",
     episode: EpisodeOption = 0,
-    seed: SeedOption = 0,
+    seed: SeedOption = 1000,
     train_seed: TrainSeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="File, .mp4 or .gif.")] = None,
     width: Annotated[int, typer.Option(min=64, help="Pixels.")] = 1280,
@@ -60,7 +60,7 @@ def view(
     task: TaskOption,
     agent: AgentOption = "mappo_minhealth",
     episode: EpisodeOption = 0,
-    seed: SeedOption = 0,
+    seed: SeedOption = 1000,
     train_seed: TrainSeedOption = 0,
     speed: Annotated[float, typer.Option(min=0.05, max=20.0, help="Times real time.")] = 1.0,
 ) -> None:

@@ -16,7 +16,7 @@ def train(
     task: Annotated[str, typer.Option(help="The task's name.")],
     out: Annotated[Path, typer.Option(help="Folder of the run; an unfinished run in it goes on.")],
     arm: Annotated[str, typer.Option(help="How credit is assigned: min_health or central.")] = "min_health",
-    seed: Annotated[int, typer.Option(min=0, help="Fixes all chance of the run.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=999, help="Fixes all chance of the run.")] = 0,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Environment steps, by default as recommended.")
     ] = None,

@@ -17,7 +17,8 @@ class Settings(Params):
     Attributes:
         task: task name.
         arm: how credit is assigned, a function of `hipg_bench.learning.credit`.
-        seed: fixes initial weights, worlds, exploration and minibatches.
+        seed: fixes initial weights, worlds, exploration and minibatches; evaluation has seeds from 1000 on,
+            so that nobody is scored on worlds they were trained in.
         steps: environment steps in all (each moves N agents).
         num_envs: B worlds side by side.
         rollout: T control steps of each between updates.
@@ -36,7 +37,7 @@ class Settings(Params):
 
     task: str
     arm: Literal["min_health", "central"] = "min_health"
-    seed: int = pydantic.Field(default=0, ge=0)
+    seed: int = pydantic.Field(default=0, ge=0, le=999)
     steps: int = pydantic.Field(default=6_000_000, ge=1)
     num_envs: int = pydantic.Field(default=256, ge=1, le=65536)
     rollout: int = pydantic.Field(default=50, ge=1, le=10_000)
