@@ -162,3 +162,14 @@ def test_weights_for_another_task_do_not_fit(network):
     agent = load_agent(network)
     with pytest.raises(BundleError, match="train again"):
         agent.policy(task_spec("hazard_nav-4").override(num_agents=5))
+
+
+def test_a_film_takes_the_first_training_whatever_its_seed() -> None:
+    """The bundled team for eight drones is of training seed 1 alone: without being told, a film finds it."""
+    from hipg_bench.cli.media import _policy
+
+    who, spec = load_agent("mappo_minhealth"), task_spec("hazard_nav-8")
+    assert 0 not in who.train_seeds("hazard_nav-8")
+    assert _policy(who, spec, None).action_size == 3
+    with pytest.raises(BundleError):
+        _policy(who, spec, 0)

@@ -14,13 +14,17 @@ if TYPE_CHECKING:
     import numpy as np
 
     from hipg_bench.env import BatchEnv
+    from hipg_bench.policies.bundle import Agent
     from hipg_bench.policies.policy import Policy
+    from hipg_bench.spec import TaskSpec
 
 AgentOption = Annotated[str, typer.Option(help="A bundled agent's name, or the path of a bundle.")]
 TaskOption = Annotated[str, typer.Option(help="The task's name.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Evaluation seed.")]
 EpisodeOption = Annotated[int, typer.Option(min=0, help="World of an evaluation with that seed.")]
-TrainSeedOption = Annotated[int, typer.Option(min=0, help="Which of the agent's trainings.")]
+TrainSeedOption = Annotated[
+    int | None, typer.Option(min=0, help="Which of the agent's trainings, by default its first.")
+]
 
 
 def video(
@@ -28,7 +32,7 @@ def video(
     agent: AgentOption = "mappo_minhealth",
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
-    train_seed: TrainSeedOption = 0,
+    train_seed: TrainSeedOption = None,
     out: Annotated[Path | None, typer.Option(help="File, .mp4 or .gif.")] = None,
     width: Annotated[int, typer.Option(min=64, help="Pixels.")] = 1280,
     height: Annotated[int, typer.Option(min=64, help="Pixels.")] = 720,
@@ -41,7 +45,7 @@ def video(
     from hipg_bench.rendering import film
 
     who, spec = load_agent(agent), registry.task_spec(task)
-    policy = who.policy(spec, train_seed)
+    policy = _policy(who, spec, train_seed)
     path = out or Path("runs") / f"{task}-{who.name}-{seed}-{episode}.mp4"
     plan = Plan(seed=seed, episodes=episode + 1, threads=1)
     with console.progress() as bars:
@@ -61,7 +65,7 @@ def view(
     agent: AgentOption = "mappo_minhealth",
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
-    train_seed: TrainSeedOption = 0,
+    train_seed: TrainSeedOption = None,
     speed: Annotated[float, typer.Option(min=0.05, max=20.0, help="Times real time.")] = 1.0,
 ) -> None:
     """Watch an agent play in an interactive window, episode after episode."""
@@ -72,7 +76,14 @@ def view(
     viewer.check_display()
     who, spec = load_agent(agent), registry.task_spec(task)
     env = registry.make(spec, 1, seed, threads=1)
-    viewer.watch(spec, _rows(env, who.policy(spec, train_seed), seed, episode), speed=speed)
+    viewer.watch(spec, _rows(env, _policy(who, spec, train_seed), seed, episode), speed=speed)
+
+
+def _policy(who: Agent, spec: TaskSpec, train_seed: int | None) -> Policy:
+    """The chosen training's policy, else that of the first training there is."""
+    if train_seed is None:
+        train_seed = min(who.train_seeds(spec.task), default=0)
+    return who.policy(spec, train_seed)
 
 
 def _rows(env: BatchEnv, policy: Policy, seed: int, episode: int) -> Iterator[np.ndarray]:
