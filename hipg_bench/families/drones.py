@@ -116,6 +116,7 @@ def _others(num_agents: int) -> np.ndarray:
 
 
 def neighbors(
+    apart: Float[np.ndarray, "n N N"],
     position: Float[np.ndarray, "n N 3"],
     velocity: Float[np.ndarray, "n N 3"],
     health: Float[np.ndarray, "n N"],
@@ -129,11 +130,10 @@ def neighbors(
     Returns:
         The blocks of `neighbor_blocks`.
     """
-    distance = coverage.distances(position, position)
     visible = _others(position.shape[1])
     if live_only:
         visible = visible & (health > 0)[:, None, :]
-    sensed = sensing.nearest_within(distance, visible, radius, slots)
+    sensed = sensing.nearest_within(apart, visible, radius, slots)
     of = np.concatenate([position, velocity, health[..., None]], axis=-1)
     own = np.concatenate([position, velocity, np.zeros_like(health)[..., None]], axis=-1)
     found = np.where(sensed.seen[..., None], sensing.gather(of, sensed) - own[:, :, None], 0.0)

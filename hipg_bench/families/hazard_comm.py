@@ -177,7 +177,8 @@ class HazardComm:
         """Own motion exactly, both terminals, own routes, nearby live drones and nearby wrecks."""
         live = now.health > 0
         radius = self.params.sensing_radius
-        wrecks = sensing.nearest_within(now.apart[:, 2:, 2:], ~live[:, None, :], radius, self._wrecks)
+        apart = now.apart[:, 2:, 2:]  # without the terminals
+        wrecks = sensing.nearest_within(apart, ~live[:, None, :], radius, self._wrecks)
         gap = sensing.gather(now.position, wrecks) - now.position[:, :, None]
         return self.layout.observation.pack(
             {
@@ -187,7 +188,7 @@ class HazardComm:
                 "terminal_position": now.terminal[:, None] - now.position[:, :, None],
                 "route": self._routes(now),
                 **drones.neighbors(
-                    now.position, now.velocity, now.health, radius, self._slots, live_only=True
+                    apart, now.position, now.velocity, now.health, radius, self._slots, live_only=True
                 ),
                 "wreck_seen": wrecks.seen,
                 "wreck_position": np.where(wrecks.seen[..., None], gap, 0.0),

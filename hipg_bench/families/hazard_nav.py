@@ -59,6 +59,7 @@ class Snapshot:
     hazardous: Bool[np.ndarray, "B P"]
     revealed: Bool[np.ndarray, "B P"]  # hazardous, and known to be
     distance: Float[np.ndarray, "B P N"]  # point to drone, m
+    apart: Float[np.ndarray, "B N N"]  # drone to drone, m
 
 
 class HazardNav:
@@ -138,6 +139,7 @@ class HazardNav:
             hazardous=sim.field["hazardous"][rows] > 0,
             revealed=sim.field["revealed"][rows] > 0,
             distance=coverage.distances(point, position),
+            apart=coverage.distances(position, position),
         )
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
@@ -181,7 +183,7 @@ class HazardNav:
                 "point_hazardous": np.take_along_axis(known, order, axis=2),
                 "point_gap": np.take_along_axis(taken, order, axis=2),
                 **drones.neighbors(
-                    now.position, now.velocity, now.health, self.params.sensing_radius, self._slots
+                    now.apart, now.position, now.velocity, now.health, self.params.sensing_radius, self._slots
                 ),
             },
             now.health.shape,
@@ -216,13 +218,11 @@ class HazardNav:
 
     def _collisions(self, now: Snapshot) -> Float[np.ndarray, "B"]:
         """Touching pairs of live drones."""
-        apart = coverage.distances(now.position, now.position)
-        return coverage.contacts(apart, now.health > 0, 2 * self.params.drone_radius).sum(axis=(1, 2)) / 2
+        return coverage.contacts(now.apart, now.health > 0, 2 * self.params.drone_radius).sum(axis=(1, 2)) / 2
 
     def _taken(self, now: Snapshot, alive: Bool[np.ndarray, "n N"]) -> Float[np.ndarray, "n N P"]:
         """Distance from each point to the nearest other live drone that drone i senses, capped."""
         radius = self.params.sensing_radius
-        apart = coverage.distances(now.position, now.position)
-        sensed = (apart <= radius) & alive[:, None, :] & ~np.eye(alive.shape[1], dtype=bool)
+        sensed = (now.apart <= radius) & alive[:, None, :] & ~np.eye(alive.shape[1], dtype=bool)
         reach = np.where(sensed[:, :, None, :], now.distance[:, None], radius)  # (n, N, P, N)
         return np.minimum(reach.min(axis=-1), radius)
