@@ -69,17 +69,27 @@ class BatchEnv:
 
     What happens in an episode depends on (seed, episode id) and the actions, never on B, on the
     thread count or on which world runs it. World b starts with episode b; a world that ends goes on
-    with the next id not yet used.
+    with the next id not yet used, in the same step, or waits for `reset` where ``autoreset`` is off.
 
     Attributes:
         spec: the task's numbers.
         layout: what each number of an observation, action and joint state is.
         model: the compiled MjModel.
         decimation: physics steps per control step.
+        metrics: names in ``Step.info["metrics"]``.
         num_envs, num_agents, action_size, observation_size, state_size: B, N, A, O, S.
     """
 
-    def __init__(self, spec: TaskSpec, family: Family, num_envs: int, seed: int, threads: int = 0) -> None:
+    def __init__(
+        self,
+        spec: TaskSpec,
+        family: Family,
+        num_envs: int,
+        seed: int,
+        *,
+        threads: int = 0,
+        autoreset: bool = True,
+    ) -> None:
         self.spec = spec
         self.family = family
         self.layout: TaskLayout = family.layout
@@ -88,6 +98,7 @@ class BatchEnv:
         self.action_size = family.layout.action.size
         self.observation_size = family.layout.observation.size
         self.state_size = family.layout.state.size
+        self.metrics = ("return", "length", "survival", "deaths", "first_death", *family.metrics)
         self.decimation = family.physics_steps
         self.model = world_model(spec, family)
         self._sim = Sim(
@@ -98,26 +109,45 @@ class BatchEnv:
             threads=threads,
         )
         self._seed = seed
+        self._autoreset = autoreset
         self._next_episode = 0
         self._now: Any = None
+        self._waiting = np.ones(num_envs, bool)
         self._closed = False
 
-    def reset(self, episode_id: Int[np.ndarray, "B"] | None = None) -> Step:
-        """Start every world anew.
+    def reset(
+        self,
+        episode_id: Int[np.ndarray, "n"] | None = None,
+        *,
+        worlds: Int[np.ndarray, "n"] | None = None,
+        seed: int | None = None,
+    ) -> Step:
+        """Start worlds anew.
 
         Args:
-            episode_id: (B,) the episodes to run, by default 0..B-1.
+            episode_id: (n,) the episodes to run, by default the next not yet used.
+            worlds: (n,) the worlds to start, by default all of them, n = B.
+            seed: a new seed, for all episodes that start from now on; it counts them from 0 again.
+
+        Returns:
+            What the agents see now, in all worlds; reward 0.
+
+        Raises:
+            HipgError: episodes or a seed below 0, or worlds outside 0..B-1 or named twice.
         """
         self._check_open()
-        ids = np.arange(self.num_envs)
-        episodes = ids if episode_id is None else np.asarray(episode_id, np.int64)
-        if episodes.shape != (self.num_envs,) or episodes.min() < 0:
+        ids = self._checked_worlds(np.arange(self.num_envs) if worlds is None else worlds)
+        first = self._next_episode if seed is None else 0
+        episodes = first + np.arange(len(ids)) if episode_id is None else np.asarray(episode_id, np.int64)
+        if episodes.shape != ids.shape or (episodes < 0).any() or (seed is not None and seed < 0):
             raise HipgError(
-                f"{self.spec.task}: episode_id must be {self.num_envs} numbers >= 0, got {episodes.tolist()}"
+                f"{self.spec.task}: {len(ids)} episode ids >= 0 and a seed >= 0 are allowed, "
+                f"got {episodes.tolist()} and {seed}"
             )
+        if seed is not None:
+            self._seed, self._next_episode = seed, 0
         self._begin(ids, episodes)
-        self._next_episode = int(episodes.max()) + 1
-        return self._resume()
+        return self._resume(ids)
 
     def step(self, action: Float[np.ndarray, "B N A"]) -> Step:
         """Advance every world by one control step; worlds whose episode ends start their next one.
@@ -173,14 +203,13 @@ class BatchEnv:
         }  # fmt: skip
         observation, state = observation.copy(), state.copy()
         info["final_rows"] = self._sim.rows[done]
-        if done.any():
+        if self._autoreset and done.any():
             ids = np.flatnonzero(done)
             self._begin(ids, self._next_episode + np.arange(len(ids)))
-            self._next_episode += len(ids)
             observation[ids], state[ids] = self._perceive(family.read(sim, ids))
             self._now = family.read(sim)
         else:
-            self._now = now
+            self._now, self._waiting = now, done
         return Step(observation, reward, terminated, truncated, {**info, **self._present(state)})
 
     @property
@@ -189,26 +218,20 @@ class BatchEnv:
         return self._sim.rows.copy()
 
     def load_rows(self, ids: Int[np.ndarray, "n"], rows: Float[np.ndarray, "n R"]) -> Step:
-        """Put saved worlds into places ``ids``; return what their agents see now, reward 0.
+        """Put saved worlds into places ``ids``; return what agents see now, reward 0.
 
         Raises:
             HipgError: rows of another task, or ids outside 0..B-1 or named twice.
         """
         self._check_open()
-        ids = np.atleast_1d(np.asarray(ids))
+        ids = self._checked_worlds(ids)
         expected = (len(ids), self._sim.rows.shape[1])
-        inside = (ids >= 0) & (ids < self.num_envs)
-        if rows.shape != expected or not inside.all() or len(np.unique(ids)) < len(ids):
-            raise HipgError(
-                f"{self.spec.task}: rows of shape {expected} for distinct ids in 0..{self.num_envs - 1} are "
-                f"allowed, got {rows.shape} for {ids.tolist()}"
-            )
-        order = np.argsort(ids)  # the engine takes ids in ascending order only
-        ids, rows = ids[order], rows[order]
+        if rows.shape != expected:
+            raise HipgError(f"{self.spec.task}: rows of shape {expected} are allowed, got {rows.shape}")
         self._sim.reset(ids)
         self._sim.rows[ids] = rows
         self._next_episode = max(self._next_episode, int(self._sim.field["episode_id"].max()) + 1)
-        return self._resume()
+        return self._resume(ids)
 
     def fork(self, rows: Float[np.ndarray, "n R"], health: Mapping[int, float]) -> Float[np.ndarray, "n R"]:
         """Return copies of saved worlds in which some agents' health is set: the true counterfactual.
@@ -259,10 +282,12 @@ class BatchEnv:
         field["toughness"][ids] = -np.log1p(-chance[:, :n])
         field["death_time"][ids] = NEVER
         field["episode_id"][ids, 0] = episodes
+        self._next_episode = max(self._next_episode, int(episodes.max(initial=-1)) + 1)
         self.family.reset(self._sim, ids, chance[:, n:])
 
-    def _resume(self) -> Step:
-        """Look at the worlds as they stand."""
+    def _resume(self, ids: Int[np.ndarray, "n"]) -> Step:
+        """Look at the worlds as they stand; ``ids`` are ready to go on."""
+        self._waiting[ids] = False
         self._now = self.family.read(self._sim)
         observation, state = self._perceive(self._now)
         nothing = np.zeros(self.num_envs, bool)
@@ -299,8 +324,7 @@ class BatchEnv:
 
     def _measure(self, now: Any, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "B"]]:
         """Metrics of the episodes that end in worlds ``ids``; NaN elsewhere."""
-        names = ("return", "length", "survival", "deaths", "first_death", *self.family.metrics)
-        out = {name: np.full(self.num_envs, np.nan) for name in names}
+        out = {name: np.full(self.num_envs, np.nan) for name in self.metrics}
         if len(ids):
             field = self._sim.field
             died_at = field["death_time"][ids]
@@ -331,6 +355,11 @@ class BatchEnv:
         self._check_open()
         if self._now is None:
             raise HipgError(f"{self.spec.task}: step() before reset()")
+        if self._waiting.any():
+            raise HipgError(
+                f"{self.spec.task}: env {int(self._waiting.argmax())} is waiting for reset(), "
+                f"its episode is over or has not begun"
+            )
         action = np.asarray(action, np.float64)
         expected = (self.num_envs, self.num_agents, self.action_size)
         if action.shape != expected:
@@ -347,6 +376,15 @@ class BatchEnv:
             )
         action = np.where(alive, action, 0.0)
         return np.clip(action, -1.0, 1.0) if self.spec.clip_actions else action
+
+    def _checked_worlds(self, worlds: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        worlds = np.atleast_1d(np.asarray(worlds))
+        inside = (worlds >= 0) & (worlds < self.num_envs)
+        if not inside.all() or len(np.unique(worlds)) < len(worlds):
+            raise HipgError(
+                f"{self.spec.task}: distinct worlds in 0..{self.num_envs - 1} are allowed, got {worlds.tolist()}"
+            )
+        return worlds
 
     def _check_open(self) -> None:
         if self._closed:

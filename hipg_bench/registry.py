@@ -63,7 +63,13 @@ def family_of(spec: TaskSpec) -> Family:
 
 
 def make(
-    task: str | TaskSpec, num_envs: int = 1, seed: int = 0, *, threads: int = 0, **overrides: Any
+    task: str | TaskSpec,
+    num_envs: int = 1,
+    seed: int = 0,
+    *,
+    threads: int = 0,
+    autoreset: bool = True,
+    **overrides: Any,
 ) -> BatchEnv:
     """Build B worlds of a task.
 
@@ -72,6 +78,7 @@ def make(
         num_envs: B >= 1.
         seed: >= 0; with the episode id it fixes all chance.
         threads: physics threads; 0 for all cores. Results do not depend on it.
+        autoreset: a world whose episode ends starts the next in the same step; else it waits for ``reset``.
         **overrides: spec fields (``num_agents``, ``horizon``, ...), family numbers, or ``weights``.
 
     Raises:
@@ -83,4 +90,4 @@ def make(
         spec = spec.override(**overrides)
     if num_envs < 1 or seed < 0:
         raise SpecError(f"{spec.task}: num_envs >= 1 and seed >= 0 are allowed, got {num_envs} and {seed}")
-    return BatchEnv(spec, family_of(spec), num_envs, seed, threads)
+    return BatchEnv(spec, family_of(spec), num_envs, seed, threads=threads, autoreset=autoreset)

@@ -103,7 +103,8 @@ class Sim:
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Return worlds to the model's defaults, all agents enabled; userdata becomes 0."""
-        self.batch.reset(ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        # the engine takes ids in ascending order only
+        self.batch.reset(np.sort(ids), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         self._disabled[ids] = 0
 
     @property

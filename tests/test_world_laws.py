@@ -10,7 +10,7 @@ import pytest
 from play import action, actions, flat, outcomes, play, same
 
 import hipg_bench
-from hipg_bench import BatchEnv, make
+from hipg_bench import BatchEnv, TaskSpec, make
 from hipg_bench.env import world_model
 from hipg_bench.registry import family_of
 
@@ -198,6 +198,9 @@ def refuse(env: BatchEnv) -> list[tuple[Callable[[], object], str]]:
         (lambda: env.step(np.zeros((4, n + 1, env.action_size))), str((4, n, env.action_size))),
         (lambda: env.step(bad), "env 2, agent 1"),
         (lambda: env.reset(np.array([0, 1, 2, -1])), ">= 0"),
+        (lambda: env.reset(worlds=np.array([4])), "0..3"),
+        (lambda: env.reset(worlds=np.array([1, 1])), "distinct"),
+        (lambda: env.reset(seed=-1), "seed >= 0"),
         (lambda: env.load_rows(np.array([4]), rows[:1]), "0..3"),
         (lambda: env.load_rows(np.array([1, 1]), rows[:2]), "distinct"),
         (lambda: env.load_rows(np.array([0]), rows[:1, :-1]), str(rows.shape[1])),
@@ -228,3 +231,51 @@ def test_an_environment_refuses_to_go_on_before_its_start_and_after_its_end():
     for use in (env.reset, lambda: env.step(rest), lambda: env.load_rows(np.array([0]), env.rows)):
         with pytest.raises(hipg_bench.errors.HipgError, match="closed"):
             use()
+
+
+def test_a_world_waits_for_its_reset_where_autoreset_is_off():
+    env = make("hazard_nav-4", 3, threads=1, autoreset=False, horizon=2)
+    rest = np.zeros((3, 4, 3))
+    env.reset()
+    env.step(rest)
+    last = env.step(rest)
+    assert last.truncated.all()
+    assert same(last.observation, last.info["final_observation"])
+    assert same(last.info["episode_id"], np.arange(3))
+    with pytest.raises(hipg_bench.errors.HipgError, match="env 0 is waiting for reset"):
+        env.step(rest)
+    fresh = env.reset(worlds=np.array([2, 0]))
+    assert fresh.info["episode_id"].tolist() == [4, 1, 3], "the others keep what they ended with"
+    assert fresh.info["elapsed"].tolist() == [0, 2, 0]
+    with pytest.raises(hipg_bench.errors.HipgError, match="env 1 is waiting for reset"):
+        env.step(rest)
+    env.reset(worlds=np.array([1]))
+    env.step(rest)
+
+
+def test_a_reset_in_mid_episode_leaves_the_other_worlds_alone(env: BatchEnv):
+    middle = play(env, env.reset(np.arange(4)), 3)[-1]
+    rows = env.rows
+    step = env.reset(np.array([9]), worlds=np.array([2]))
+    others = np.array([0, 1, 3])
+    assert same(step.observation[others], middle.observation[others])
+    assert same(env.rows[others], rows[others])
+    fresh = make(env.spec, 1, threads=1).reset(np.array([9]))
+    assert same(step.observation[[2]], fresh.observation)
+    assert same(env.rows[[2]], make_rows(env.spec, 9))
+
+
+def make_rows(spec: TaskSpec, episode: int) -> np.ndarray:
+    """The first row of an episode."""
+    alone = make(spec, 1, threads=1)
+    alone.reset(np.array([episode]))
+    return alone.rows
+
+
+def test_a_new_seed_counts_episodes_from_the_start(env: BatchEnv):
+    play(env, env.reset(), 2)
+    step = env.reset(seed=77)
+    assert step.info["episode_id"].tolist() == [0, 1, 2, 3]
+    assert same(step.observation, make(env.spec, 4, seed=77, threads=1).reset().observation)
+    again = env.reset()
+    assert again.info["episode_id"].tolist() == [4, 5, 6, 7], "a reset goes on with unused episodes"
