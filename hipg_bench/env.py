@@ -382,7 +382,8 @@ class BatchEnv:
         inside = (worlds >= 0) & (worlds < self.num_envs)
         if not inside.all() or len(np.unique(worlds)) < len(worlds):
             raise HipgError(
-                f"{self.spec.task}: distinct worlds in 0..{self.num_envs - 1} are allowed, got {worlds.tolist()}"
+                f"{self.spec.task}: distinct worlds in 0..{self.num_envs - 1} are allowed, "
+                f"got {worlds.tolist()}"
             )
         return worlds
 
