@@ -11,10 +11,10 @@ import torch
 from hipg_bench.errors import ResumeError, SpecError
 from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
-from hipg_bench.learning.mappo import Trainer, surrogate
-from hipg_bench.learning.networks import RunningNorm
+from hipg_bench.learning.mappo import Trainer, surrogate, value_loss
+from hipg_bench.learning.networks import RunningNorm, Tanh
 from hipg_bench.learning.run import train
-from hipg_bench.learning.settings import recommended
+from hipg_bench.learning.settings import PRESETS, paper, recommended
 from hipg_bench.policies.network import load_network, save_network
 
 SMALL = {"num_envs": 8, "rollout": 10, "steps": 8 * 10 * 4, "actor_hidden": (16,), "critic_hidden": (16,)}
@@ -61,14 +61,28 @@ def test_min_health_credit_by_hand() -> None:
     # eqn:min_health_baseline_ppo with V_targ = 10: h = 1 and V(s without 0) = 7 -> 3;
     # h = 0.5 and V(s without 1) = 4 -> 0.5 * 6 = 3; h = 0 -> 0 whatever the critic says
     psi = credit.min_health(
-        torch.tensor([10.0]), torch.tensor([[7.0, 4.0, -50.0]]), torch.tensor([[1.0, 0.5, 0.0]])
+        torch.tensor([[10.0]]), torch.tensor([[7.0, 4.0, -50.0]]), torch.tensor([[1.0, 0.5, 0.0]])
     )
     torch.testing.assert_close(psi, torch.tensor([[3.0, 3.0, 0.0]]))
 
 
-def test_central_credit_by_hand() -> None:
-    psi = credit.central(torch.tensor([10.0]), torch.tensor([8.0]), torch.tensor([[1.0, 0.0]]))
-    torch.testing.assert_close(psi, torch.tensor([[2.0, 0.0]]))
+def test_central_and_local_credit_by_hand() -> None:
+    # one value for the team: 10 - 8; one for each agent: 10 - 8 and 10 - 4; none for the dead
+    health = torch.tensor([[1.0, 1.0, 0.0]])
+    psi = credit.advantage(torch.tensor([[10.0]]), torch.tensor([[8.0]]), health)
+    torch.testing.assert_close(psi, torch.tensor([[2.0, 2.0, 0.0]]))
+    own = credit.advantage(torch.full((1, 3), 10.0), torch.tensor([[8.0, 4.0, 1.0]]), health)
+    torch.testing.assert_close(own, torch.tensor([[2.0, 6.0, 0.0]]))
+
+
+def test_value_clip_by_hand() -> None:
+    # before 0, reach 1: value 3 aiming at 5: (3-5)^2 = 4 against (1-5)^2 = 16 -> 16, and no gradient;
+    # value 0.5 aiming at 5 is within reach: 4.5^2 = 20.25, gradient 2 * (0.5 - 5) / 2 samples = -4.5
+    value = torch.tensor([3.0, 0.5], requires_grad=True)
+    loss = value_loss(value, torch.zeros(2), torch.tensor([5.0, 5.0]), 1.0)
+    assert float(loss.detach()) == pytest.approx((16 + 20.25) / 2)
+    loss.backward()
+    torch.testing.assert_close(value.grad, torch.tensor([0.0, -4.5]))
 
 
 @pytest.mark.parametrize("dead_value", [0.0, 1.0])
@@ -121,7 +135,7 @@ def test_a_dead_agents_sample_has_no_gradient() -> None:
     data = trainer.roll_out()
     data.health[:, :, 1] = 0.0
     data.observation.requires_grad_(True)
-    _, psi = trainer._credit(data)
+    _, psi = trainer.assign_credit(data)
     policy = trainer.actor(data.observation)
     change = policy.log_prob(data.action).sum(-1) - data.log_prob
     surrogate(change.flatten(), psi.flatten(), 0.2).backward()
@@ -186,3 +200,64 @@ def test_learning_pays_off_in_a_minute() -> None:
     trainer = Trainer(recommended("coop_nav-3", num_envs=64, actor_hidden=(64,), critic_hidden=(64,)))
     returns = [trainer.iterate()["return"] for _ in range(12)]
     assert np.mean(returns[-2:]) > np.mean(returns[:2]) + 4
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("arm", ["local", "central", "min_health"])
+def test_every_arm_and_preset_improves_both_networks(preset: str, arm: str) -> None:
+    trainer = Trainer(PRESETS[preset]("paper_nav-4", arm=arm, **SMALL))
+    before = [p.detach().clone() for p in (*trainer.actor.parameters(), *trainer.critic.parameters())]
+    log = trainer.iterate()
+    assert all(np.isfinite(value) for name, value in log.items() if name != "first_death")
+    after = [*trainer.actor.parameters(), *trainer.critic.parameters()]
+    assert all((a != b).any() for a, b in zip(before, after, strict=True))
+
+
+def test_a_local_critic_sees_one_agent_only() -> None:
+    trainer = Trainer(recommended("hazard_nav-4", arm="local", **SMALL))
+    data = trainer.roll_out()
+    target, _ = trainer.assign_credit(data)
+    assert target.shape == (10, 8, 4)
+    seen, elapsed = trainer._shown(data.observation, data.state, data.elapsed)
+    value = trainer.critic(seen, elapsed)
+    changed = data.observation.clone()
+    changed[:, :, 0] += 1.0
+    other = trainer.critic(*trainer._shown(changed, data.state, data.elapsed))
+    assert (other[:, :, 0] != value[:, :, 0]).any()
+    torch.testing.assert_close(other[:, :, 1:], value[:, :, 1:])
+
+
+def test_dead_samples_move_the_actor_only_where_they_are_not_masked() -> None:
+    """What the dead are told to do (their stored actions) changes the update, or does not."""
+    ends: dict[bool, list[torch.Tensor]] = {True: [], False: []}
+    for masked, moved in ((masked, moved) for masked in ends for moved in (0.0, 0.5)):
+        trainer = Trainer(recommended("hazard_nav-4", arm="central", mask_dead=masked, **SMALL))
+        data = trainer.roll_out()
+        data.health[:, :, 1] = 0.0
+        target, psi = trainer.assign_credit(data)
+        data.action[:, :, 1] += moved
+        trainer.update(data, target, psi)
+        ends[masked].append(torch.cat([p.detach().flatten() for p in trainer.actor.parameters()]))
+    assert torch.equal(*ends[True])
+    assert not torch.equal(*ends[False])
+
+
+def test_the_papers_quirks_are_in_its_preset() -> None:
+    settings = paper("paper_nav-8", arm="central")
+    # facts sheet, section 5: 50,000 episodes of 50 steps, 256 a batch, 8 epochs, 8 minibatches
+    assert settings.steps == 50_000 * 50
+    assert settings.num_envs * settings.rollout == 256 * 50
+    assert (settings.epochs, settings.minibatches, settings.value_clip) == (8, 8, 0.2)
+    assert not settings.mask_dead
+    assert not settings.bootstrap_truncation
+    trainer = Trainer(paper("paper_nav-8", arm="local", num_envs=4))
+    data = trainer.roll_out()
+    trainer.assign_credit(data)
+    assert (trainer.actor.norm.scale == 1).all()
+    assert (trainer.critic.returns.scale == 1).all()
+    assert (data.action[data.health == 0] == 0).all()
+
+
+def test_fast_tanh_is_tanh() -> None:
+    x = torch.linspace(-12, 12, 1001)
+    torch.testing.assert_close(Tanh()(x), torch.tanh(x), atol=2e-7, rtol=0)

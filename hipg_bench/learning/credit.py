@@ -12,15 +12,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def central(
-    target: Float[Tensor, "X"], value: Float[Tensor, "X"], health: Float[Tensor, "X N"]
+def advantage(
+    target: Float[Tensor, "X K"], value: Float[Tensor, "X K"], health: Float[Tensor, "X N"]
 ) -> Float[Tensor, "X N"]:
-    """Psi_i = h_i (V_targ - V(s)): the team's advantage, the same for every live agent."""
-    return health * (target - value)[:, None]
+    """Psi_i = h_i (V_targ - V): the arms ``central``, V(s) shared by all, and ``local``, V(o_i) of each.
+
+    Args:
+        target: V_targ of eqn:value_target, K = 1 for all agents or K = N.
+        value: the critic's value of the same.
+        health: h_i, in [0, 1].
+    """
+    return health * (target - value)
 
 
 def min_health(
-    target: Float[Tensor, "X"], without: Float[Tensor, "X N"], health: Float[Tensor, "X N"]
+    target: Float[Tensor, "X 1"], without: Float[Tensor, "X N"], health: Float[Tensor, "X N"]
 ) -> Float[Tensor, "X N"]:
     """Psi_i = h_i (V_targ - V(s with only h_i := 0)), eqn:min_health_baseline_ppo.
 
@@ -29,7 +35,7 @@ def min_health(
         without: the critic's value of the same state with agent i dead.
         health: h_i, in [0, 1].
     """
-    return health * (target[:, None] - without)
+    return health * (target - without)
 
 
 def with_each_dead(
@@ -42,7 +48,7 @@ def with_each_dead(
     return copies
 
 
-def normalized(psi: Float[Tensor, "X N"], live: Bool[Tensor, "X N"]) -> Float[Tensor, "X N"]:
-    """Zero mean and unit deviation over live samples; 0 for the dead."""
-    chosen = psi[live]
-    return torch.where(live, (psi - chosen.mean()) / (chosen.std() + 1e-8), 0.0)
+def normalized(psi: Float[Tensor, "X N"], counted: Bool[Tensor, "X N"]) -> Float[Tensor, "X N"]:
+    """Zero mean and unit deviation over the counted samples; 0 for the others."""
+    chosen = psi[counted]
+    return torch.where(counted, (psi - chosen.mean()) / (chosen.std() + 1e-8), 0.0)

@@ -8,18 +8,20 @@ from torch import Tensor
 
 
 def gae(
-    reward: Float[Tensor, "T B"],
-    value: Float[Tensor, "T B"],
-    next_value: Float[Tensor, "T B"],
-    terminated: Bool[Tensor, "T B"],
-    done: Bool[Tensor, "T B"],
+    reward: Float[Tensor, "T *#who"],
+    value: Float[Tensor, "T *#who"],
+    next_value: Float[Tensor, "T *#who"],
+    terminated: Bool[Tensor, "T *#who"],
+    done: Bool[Tensor, "T *#who"],
     gamma: float,
     lam: float,
-) -> Float[Tensor, "T B"]:
+) -> Float[Tensor, "T *who"]:
     """Advantage of each step; the value target of eqn:value_target is this plus ``value``.
 
     A_t = delta_t + gamma * lam * A_{t+1} with delta_t = r_t + gamma * V_{t+1} - V_t. Termination ends
     both sums; truncation ends the sum over A but still bootstraps delta from V of the state it cut.
+
+    ``who`` is (B, K): K values a world, with one reward for all.
 
     Args:
         reward: r_t.

@@ -1,12 +1,12 @@
 """MAPPO with min-health crediting (algorithm 1 of the paper), top to bottom.
 
-One policy, shared by all agents, acts on each agent's own observation; one central critic sees the
-joint state, health included. What sets the arms apart is `_credit`: how the team's advantage becomes
-each agent's weight Psi_i.
+One policy, shared by all agents, acts on each agent's own observation; the critic sees the joint
+state, health included, or in the arm ``local`` each agent's own observation. What sets the arms apart
+is `Trainer.assign_credit`: how the team's advantage becomes each agent's weight Psi_i.
 
-Differences from the authors' code, in every arm: dead samples are masked and Psi is normalised over
-live samples only; returns are normalised instead of clipping the value's change; the critic knows how
-much of the horizon has passed; truncation bootstraps, termination does not.
+Where the recommended settings differ from the authors' code, in every arm: dead samples are masked and
+Psi is normalised over live samples only; returns are normalised instead of clipping the value's
+change; truncation bootstraps, termination does not. `Settings` names each of these.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class Rollout:
     reward: Float[Tensor, "T B"]
     terminated: Bool[Tensor, "T B"]
     done: Bool[Tensor, "T B"]
-    next_state: Float[Tensor, "T B S"]  # what the step led to, before any autoreset
+    next_observation: Float[Tensor, "T B N O"]  # what the step led to, before any autoreset
+    next_state: Float[Tensor, "T B S"]
     next_elapsed: Float[Tensor, "T B"]
     episodes: list[dict[str, float]]  # metrics of those that ended
 
@@ -66,9 +67,20 @@ class Trainer:
         )
         layout = self.env.layout
         self.actor = Actor(
-            self.env.observation_size, self.env.action_size, settings.actor_hidden, settings.std
+            self.env.observation_size,
+            self.env.action_size,
+            settings.actor_hidden,
+            settings.std,
+            normalize=settings.normalize_inputs,
         )
-        self.critic = Critic(self.env.state_size, settings.critic_hidden, layout.health_columns)
+        local = settings.arm == "local"
+        self.critic = Critic(
+            self.env.observation_size if local else self.env.state_size,
+            settings.critic_hidden,
+            np.empty(0, np.int64) if local else layout.health_columns,
+            normalize=settings.normalize_inputs,
+            normalize_returns=settings.normalize_returns,
+        )
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, eps=1e-5)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, eps=1e-5)
         self.iteration = 0
@@ -77,9 +89,8 @@ class Trainer:
     def iterate(self) -> dict[str, float]:
         """One round of algorithm 1: roll out, value targets, credit, update. Returns what to log."""
         data = self.roll_out()
-        self._learn_scales(data)
-        target, psi = self._credit(data)
-        log = self._update_actor(data, psi) | self._update_critic(data, target)
+        target, psi = self.assign_credit(data)
+        log = self.update(data, target, psi)
         self.iteration += 1
         for name in data.episodes[0] if data.episodes else ():
             # mean over the episodes in which the metric is defined
@@ -103,6 +114,7 @@ class Trainer:
             reward=torch.empty(T, B),
             terminated=torch.empty(T, B, dtype=torch.bool),
             done=torch.empty(T, B, dtype=torch.bool),
+            next_observation=torch.empty(T, B, N, env.observation_size),
             next_state=torch.empty(T, B, env.state_size),
             next_elapsed=torch.empty(T, B),
             episodes=[],
@@ -117,36 +129,58 @@ class Trainer:
             data.action[t] = policy.sample()
             data.log_prob[t] = policy.log_prob(data.action[t]).sum(-1)
             now = self.step = env.step(data.action[t].numpy())
+            if settings.zero_dead_actions:
+                data.action[t][data.health[t] == 0] = 0.0
             data.reward[t] = torch.from_numpy(now.reward)
             data.terminated[t] = torch.from_numpy(now.terminated)
             data.done[t] = torch.from_numpy(now.terminated | now.truncated)
+            data.next_observation[t] = torch.from_numpy(now.info["final_observation"])
             data.next_state[t] = torch.from_numpy(now.info["final_state"])
             data.next_elapsed[t] = data.elapsed[t] + 1 / env.spec.horizon
             for b in np.flatnonzero(data.done[t].numpy()):
                 data.episodes.append({name: float(values[b]) for name, values in now.info["metrics"].items()})
         return data
 
-    def _learn_scales(self, data: Rollout) -> None:
-        """Update the normalisation of what live agents see and of joint states."""
-        self.actor.norm.update(data.observation[data.health > 0])
-        self.critic.norm.update(data.state.flatten(0, 1))
-
     @torch.no_grad()
-    def _credit(self, data: Rollout) -> tuple[Float[Tensor, "T B"], Float[Tensor, "T B N"]]:
-        """Value targets (eqn:value_target), and each agent's normalised weight Psi (the arm)."""
+    def assign_credit(self, data: Rollout) -> tuple[Float[Tensor, "T B K"], Float[Tensor, "T B N"]]:
+        """Value targets (eqn:value_target), and each agent's weight Psi (the arm).
+
+        There are K = N critics' views in the arm ``local``, else K = 1. Running normalisation takes in
+        the rollout on the way.
+        """
         settings = self.settings
-        value = self.critic(data.state, data.elapsed)
-        next_value = self.critic(data.next_state, data.next_elapsed)
+        self.actor.norm.update(data.observation[data.health > 0])
+        seen, elapsed = self._shown(data.observation, data.state, data.elapsed)
+        self.critic.norm.update(seen.flatten(0, -2))
+        value = self.critic(seen, elapsed)
+        next_value = self.critic(*self._shown(data.next_observation, data.next_state, data.next_elapsed))
+        ended = data.terminated if settings.bootstrap_truncation else data.done
         target = value + gae(
-            data.reward, value, next_value, data.terminated, data.done, settings.gamma, settings.lam
-        )
-        health = data.health.flatten(0, 1)
-        if settings.arm == "central":
-            psi = credit.central(target.flatten(), value.flatten(), health)
+            data.reward[..., None], value, next_value, ended[..., None], data.done[..., None],
+            settings.gamma, settings.lam,
+        )  # fmt: skip
+
+        masked = settings.mask_dead or settings.arm == "min_health"
+        health = (data.health if masked else torch.ones_like(data.health)).flatten(0, 1)
+        if settings.arm == "min_health":
+            psi = credit.min_health(target.flatten(0, 1), self._value_without_each(data), health)
         else:
-            psi = credit.min_health(target.flatten(), self._value_without_each(data), health)
+            psi = credit.advantage(target.flatten(0, 1), value.flatten(0, 1), health)
+        if settings.psi_over != "minibatch":
+            counted = health > 0 if settings.psi_over == "live" else torch.ones_like(health, dtype=torch.bool)
+            psi = health.ceil() * credit.normalized(psi, counted)
         self.critic.returns.update(target.flatten()[:, None])
-        return target, credit.normalized(psi, health > 0).view_as(data.health)
+        return target, psi.view_as(data.health)
+
+    def _shown(
+        self,
+        observation: Float[Tensor, "T B N O"],
+        state: Float[Tensor, "T B S"],
+        elapsed: Float[Tensor, "T B"],
+    ) -> tuple[Float[Tensor, "T B K F"], Float[Tensor, "T B K"]]:
+        """What the arm's critic is shown: the joint state, or every agent's own observation."""
+        seen = observation if self.settings.arm == "local" else state[:, :, None]
+        return seen, elapsed[..., None].expand(seen.shape[:-1])
 
     def _value_without_each(self, data: Rollout) -> Float[Tensor, "TB N"]:
         """V(s with only h_i := 0) for every agent i."""
@@ -157,20 +191,31 @@ class Trainer:
             values.append(self.critic(copies, elapsed[:, None].expand(copies.shape[:2])))
         return torch.cat(values)
 
+    def update(
+        self, data: Rollout, target: Float[Tensor, "T B K"], psi: Float[Tensor, "T B N"]
+    ) -> dict[str, float]:
+        """Improve actor and critic on a rollout. Returns what to log."""
+        return self._update_actor(data, psi) | self._update_critic(data, target)
+
     def _update_actor(self, data: Rollout, psi: Float[Tensor, "T B N"]) -> dict[str, float]:
-        """Ascend the clipped surrogate with entropy (eqn:surrogate_objective_clipped) on live samples."""
-        settings, live = self.settings, data.health > 0
-        observation, action = data.observation[live], data.action[live]
-        log_prob, weight = data.log_prob[live], psi[live]
+        """Ascend the clipped surrogate with entropy (eqn:surrogate_objective_clipped)."""
+        settings = self.settings
+        used = data.health > 0 if settings.mask_dead else torch.ones_like(data.health, dtype=torch.bool)
+        with torch.no_grad():
+            observation = self.actor.norm(data.observation[used])
+        action, log_prob, weight = data.action[used], data.log_prob[used], psi[used]
         divergence = entropy = 0.0
         for _ in range(settings.epochs):
             divergence = 0.0
             parts = torch.randperm(len(weight)).chunk(settings.minibatches)
             for part in parts:
-                policy = self.actor(observation[part])
+                policy = self.actor.distribution(observation[part])
                 change = policy.log_prob(action[part]).sum(-1) - log_prob[part]
                 spread = policy.entropy().sum(-1).mean()
-                loss = -surrogate(change, weight[part], settings.clip) - settings.entropy * spread
+                credited = weight[part]
+                if settings.psi_over == "minibatch":
+                    credited = (credited - credited.mean()) / (credited.std() + 1e-8)
+                loss = -surrogate(change, credited, settings.clip) - settings.entropy * spread
                 _descend(self.actor_optimizer, loss, settings.max_grad_norm)
                 # k3 estimator of KL(old, new): unbiased and never negative
                 divergence += float((change.exp() - 1 - change).mean().detach()) / len(parts)
@@ -182,22 +227,29 @@ class Trainer:
     def _follow_divergence(self, divergence: float) -> None:
         """Keep the policy's change per rollout near ``target_kl`` by moving the learning rate."""
         group, target = self.actor_optimizer.param_groups[0], self.settings.target_kl
+        if target is None:
+            return
         factor = 1 / 1.5 if divergence > 2 * target else 1.5 if divergence < target / 2 else 1.0
         group["lr"] = float(np.clip(group["lr"] * factor, *_RATES))
 
-    def _update_critic(self, data: Rollout, target: Float[Tensor, "T B"]) -> dict[str, float]:
+    def _update_critic(self, data: Rollout, target: Float[Tensor, "T B K"]) -> dict[str, float]:
         """Descend the squared error of normalised values (eqn:value_update)."""
         settings, returns = self.settings, self.critic.returns
-        state, elapsed = data.state.flatten(0, 1), data.elapsed.flatten()
-        aim = (target.flatten() - returns.offset) / returns.scale
+        seen, elapsed = self._shown(data.observation, data.state, data.elapsed)
+        with torch.no_grad():
+            inputs = self.critic.inputs(seen, elapsed).flatten(0, -2)
+            before = self.critic.normalized(inputs)
+            aim = (target.flatten() - returns.offset) / returns.scale
+        reach = settings.value_clip and settings.value_clip / float(returns.scale)
         error = 0.0
         for _ in range(settings.epochs):
             parts = torch.randperm(len(aim)).chunk(settings.minibatches)
             error = 0.0
             for part in parts:
-                loss = (self.critic.normalized(state[part], elapsed[part]) - aim[part]).square().mean()
+                value = self.critic.normalized(inputs[part])
+                loss = value_loss(value, before[part], aim[part], reach)
                 _descend(self.critic_optimizer, loss, settings.max_grad_norm)
-                error += float(loss.detach()) / len(parts)
+                error += float((value.detach() - aim[part]).square().mean()) / len(parts)
         return {"value_loss": error, "explained": 1 - error / float(aim.var())}
 
     def save(self, path: Path) -> None:
@@ -249,6 +301,24 @@ def surrogate(change: Float[Tensor, "X"], psi: Float[Tensor, "X"], clip: float) 
     """
     ratio = change.exp()
     return torch.minimum(ratio * psi, ratio.clamp(1 - clip, 1 + clip) * psi).mean()
+
+
+def value_loss(
+    value: Float[Tensor, "X"], before: Float[Tensor, "X"], aim: Float[Tensor, "X"], reach: float | None
+) -> Float[Tensor, ""]:
+    """Mean squared error of values, of which no sample gains by moving further than ``reach``.
+
+    Args:
+        value: as the critic says now.
+        before: as it said before the update.
+        aim: value targets, all three in the same units.
+        reach: None does not clip.
+    """
+    error = (value - aim).square()
+    if reach is not None:
+        clipped = before + (value - before).clamp(-reach, reach)
+        error = torch.maximum(error, (clipped - aim).square())
+    return error.mean()
 
 
 def _descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> None:
