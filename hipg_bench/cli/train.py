@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from hipg_bench.cli import console
-from hipg_bench.errors import SpecError
+from hipg_bench.errors import SpecError, hint
 
 
 def train(
-    task: Annotated[str, typer.Option(help="The task's name.")],
     out: Annotated[Path, typer.Option(help="Folder of the run; an unfinished run in it goes on.")],
-    arm: Annotated[str, typer.Option(help="How credit is assigned: min_health or central.")] = "min_health",
+    task: Annotated[str | None, typer.Option(help="The task's name.")] = None,
+    arm: Annotated[
+        str, typer.Option(help="How credit is assigned: min_health, central or local.")
+    ] = "min_health",
+    preset: Annotated[
+        str, typer.Option(help="Settings to start from: recommended or paper.")
+    ] = "recommended",
     seed: Annotated[int, typer.Option(min=0, max=999, help="Fixes all chance of the run.")] = 0,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Environment steps, by default as recommended.")
+        int | None, typer.Option(min=1, help="Environment steps, by default the preset's.")
     ] = None,
     setting: Annotated[
         list[str] | None, typer.Option("--set", help="Another setting, as name=value; may be repeated.")
@@ -26,21 +32,36 @@ def train(
     threads: Annotated[
         int, typer.Option(min=1, help="Of physics and of torch. One run per core is faster.")
     ] = 1,
+    sweep: Annotated[
+        Path | None, typer.Option(help="A file that lists many runs, instead of --task.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Runs of a sweep at a time, by default one per core.")
+    ] = None,
 ) -> None:
-    """Train a MAPPO team; a killed run goes on from its last checkpoint with the same command."""
+    """Train a MAPPO team, or the many of a sweep; what was killed goes on with the same command."""
+    if (task is None) == (sweep is None):
+        raise SpecError("train takes either --task or --sweep")
+    if sweep is not None:
+        _train_many(sweep, out, workers or os.cpu_count() or 1)
+        return
+
     import torch
 
     from hipg_bench.learning.run import train as run
-    from hipg_bench.learning.settings import recommended
+    from hipg_bench.learning.settings import PRESETS
 
     torch.set_num_threads(threads)
+    if preset not in PRESETS:
+        raise SpecError(f"no preset {preset!r}{hint(preset, PRESETS)}")
     changes: dict[str, Any] = {"arm": arm, "seed": seed, **_parsed(setting or [])}
     if steps is not None:
         changes["steps"] = steps
-    settings = recommended(task, **changes)
+    settings = PRESETS[preset](task, **changes)
     options = [
         f"--task {task}",
         f"--arm {arm}",
+        f"--preset {preset}",
         f"--seed {seed}",
         *(f"--set {pair}" for pair in setting or []),
     ]
@@ -56,6 +77,26 @@ def train(
 
         run(settings, out, command=command, report=report)
     console.say(f"policy: {out / 'policy.safetensors'}, curve: {out / 'curve.csv'}")
+
+
+def _train_many(sweep: Path, out: Path, workers: int) -> None:
+    from hipg_bench.learning.sweep import Run, load, work_off
+
+    runs = load(sweep, out)
+    left = sum(not run.finished for run in runs)
+    console.say(
+        f"[bold]{sweep.name}[/bold]: {left} of {len(runs)} runs to do, {workers} at a time, into {out}"
+    )
+    with console.progress() as bars:
+        bar = bars.add_task("training", total=sum(run.settings.steps for run in runs))
+
+        def report(runs: list[Run]) -> None:
+            ended = sum(run.finished for run in runs)
+            steps = sum(min(run.done, run.settings.steps) for run in runs)
+            bars.update(bar, completed=steps, description=f"{ended}/{len(runs)} runs")
+
+        work_off(runs, workers, report)
+    console.say(f"{len(runs)} runs are finished in {out}")
 
 
 def _parsed(pairs: list[str]) -> dict[str, Any]:

@@ -1,0 +1,131 @@
+"""Many training runs from one file, one process per core; stopped, it goes on where it was.
+
+A sweep file lists groups of runs::
+
+    [[run]]
+    tasks = ["hazard_nav-4", "hazard_nav-8"]
+    arms = ["min_health", "central"]
+    seeds = [0, 1, 2]
+    preset = "recommended"        # or "paper"
+    settings = { gamma = 0.95 }   # what differs from the preset
+    label = "g95"                 # optional, part of the folders' names
+
+Every combination is one run, in the folder ``<out>/<task>/<arm>[-<label>]/seed<k>``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import multiprocessing
+import tomllib
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import pydantic
+import torch
+
+from hipg_bench.errors import SpecError
+from hipg_bench.learning.run import train
+from hipg_bench.learning.settings import PRESETS, Settings
+from hipg_bench.spec import Params, parse
+
+_LOOK_EVERY = 5.0
+"""Seconds between two looks at how far the runs are."""
+
+
+class Group(Params):
+    """Runs that share everything but task, arm and seed."""
+
+    tasks: tuple[str, ...] = pydantic.Field(min_length=1)
+    arms: tuple[str, ...] = ("min_health",)
+    seeds: tuple[int, ...] = (0,)
+    preset: Literal["recommended", "paper"] = "recommended"
+    settings: dict[str, Any] = pydantic.Field(default_factory=dict[str, Any])
+    label: str = pydantic.Field(default="", pattern=r"^[a-z0-9_]*$")
+
+
+class Sweep(Params):
+    """A sweep file."""
+
+    run: tuple[Group, ...] = pydantic.Field(min_length=1)
+
+
+class Run(NamedTuple):
+    """One run of a sweep."""
+
+    settings: Settings
+    out: Path
+    command: str
+
+    @property
+    def done(self) -> int:
+        """Environment steps that are on disk."""
+        record = self.out / "train.json"
+        return json.loads(record.read_text())["env_steps"] if record.exists() else 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.done >= self.settings.steps
+
+
+def load(path: Path, out: Path) -> list[Run]:
+    """Read a sweep file; the runs are those of its groups, seed by seed, so that early results cover all.
+
+    Raises:
+        SpecError: not readable, a field or setting that is not allowed, or two runs in one folder.
+        UnknownNameError: no such task.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SpecError(f"{path} is not a readable sweep file: {error}") from error
+    sweep = parse(Sweep, content, str(path))
+    runs = [run for group in sweep.run for run in _runs(group, out)]
+    folders = [run.out for run in runs]
+    if len(set(folders)) < len(folders):
+        twice = next(folder for folder in folders if folders.count(folder) > 1)
+        raise SpecError(f"{path}: two runs would share {twice}: give one of their groups a label")
+    return sorted(runs, key=lambda run: run.settings.seed)
+
+
+def work_off(runs: list[Run], workers: int, report: Callable[[list[Run]], None]) -> None:
+    """Train what is not finished, ``workers`` runs at a time with one thread each.
+
+    Args:
+        runs: of `load`.
+        workers: processes.
+        report: called every few seconds with all runs.
+
+    Raises:
+        HipgError: what a run raised; the others end first.
+    """
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        waiting: set[Future[None]] = {
+            pool.submit(_train, run.settings, run.out, run.command) for run in runs if not run.finished
+        }
+        failed: list[Future[None]] = []
+        while waiting:
+            ended, waiting = wait(waiting, _LOOK_EVERY, FIRST_COMPLETED)
+            failed += [run for run in ended if run.exception()]
+            report(runs)
+    for run in failed:
+        run.result()
+
+
+def _runs(group: Group, out: Path) -> Iterator[Run]:
+    for task, arm, seed in itertools.product(group.tasks, group.arms, group.seeds):
+        settings = PRESETS[group.preset](task, **{"arm": arm, "seed": seed, **group.settings})
+        folder = out / task / (f"{arm}-{group.label}" if group.label else arm) / f"seed{seed}"
+        changed = [f"--set {name}={json.dumps(value)}" for name, value in group.settings.items()]
+        options = [f"--task {task} --arm {arm} --preset {group.preset} --seed {seed}", *changed]
+        yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]))
+
+
+def _train(settings: Settings, out: Path, command: str) -> None:
+    torch.set_num_threads(1)
+    train(settings, out, command=command)
