@@ -11,7 +11,7 @@ import hashlib
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import pydantic
 
@@ -62,6 +62,9 @@ class TaskSpec(Params):
         control_step: seconds per control step.
         clip_actions: clip to [-1, 1]; off only in the paper suite, as in the authors' code.
         graded_health: health falls with exposure and scales actuator authority, instead of binary.
+        reward_dead: what APIs that pay agents one by one and keep the dead in the team pay them: ``none``,
+            and the episode is over when all are dead; or ``team``, the team's reward to the end of the
+            task's own episode, so that dying spares nobody a cost. `BatchEnv` pays the team, whatever it is.
         params: the family's numbers.
         weights: reward per unit of each term.
         floor: return of an episode whose physics diverged; below anything a policy reaches.
@@ -79,6 +82,7 @@ class TaskSpec(Params):
     control_step: float = pydantic.Field(gt=0)
     clip_actions: bool = True
     graded_health: bool = False
+    reward_dead: Literal["none", "team"] = "none"
     params: dict[str, Any]
     weights: dict[str, float]
     floor: float
@@ -88,7 +92,7 @@ class TaskSpec(Params):
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits over everything that affects behaviour (not over anchors or prose)."""
-        behaviour = self.model_dump(exclude={"anchors", "calibration", "summary", "tags"})
+        behaviour = self.model_dump(exclude={"anchors", "calibration", "summary", "tags", "reward_dead"})
         text = json.dumps(behaviour, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -114,7 +118,7 @@ class TaskSpec(Params):
             SpecError: unknown field, or a value that is not allowed.
         """
         values = self.model_dump()
-        own = {"num_agents", "horizon", "control_step", "clip_actions", "graded_health"}
+        own = {"num_agents", "horizon", "control_step", "clip_actions", "graded_health", "reward_dead"}
         for name, value in changes.items():
             if name in own:
                 values[name] = value

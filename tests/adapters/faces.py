@@ -31,7 +31,7 @@ class Seen:
         live: (N,) the face still lists the agent, and expects an action of it.
         alive: (N,) the agent's health is above 0, as the face tells it.
         state: (S,) joint state, None where the face has none.
-        over: the episode is over; in faces that start the next one at once, all else is of the one that ended.
+        over: the episode is over; faces that start the next one at once show the one that ended all the same.
         info_keys: the different sets of keys of the infos returned; one, always the same, is right.
     """
 
