@@ -13,6 +13,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hipg_bench.adapters.dm_env import load
+    from hipg_bench.adapters.pettingzoo import parallel_env
     from hipg_bench.env import BatchEnv, Step
     from hipg_bench.layout import Block, Layout, TaskLayout
     from hipg_bench.registry import make, tagged, task_spec, tasks
@@ -27,13 +29,17 @@ __all__ = [
     "Step",
     "TaskLayout",
     "TaskSpec",
+    "load",
     "make",
+    "parallel_env",
     "tagged",
     "task_spec",
     "tasks",
 ]
 
 _HOMES = {
+    "adapters.dm_env": ("load",),
+    "adapters.pettingzoo": ("parallel_env",),
     "env": ("BatchEnv", "Step"),
     "layout": ("Block", "Layout", "TaskLayout"),
     "registry": ("make", "tagged", "task_spec", "tasks"),

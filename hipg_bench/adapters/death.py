@@ -14,11 +14,6 @@ from hipg_bench.env import Step
 from hipg_bench.spec import TaskSpec
 
 
-def agent_names(spec: TaskSpec) -> list[str]:
-    """``agent_0`` to ``agent_{N-1}``."""
-    return [f"agent_{i}" for i in range(spec.num_agents)]
-
-
 def pay(spec: TaskSpec, step: Step, lived: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
     """What each agent gets for a step.
 

@@ -1,0 +1,139 @@
+"""Gymnasium's ``make_vec``: B worlds stepped together, each team as one agent (see `gymnasium`).
+
+All three ways to go on after an episode are here, as ``autoreset_mode``: in the same step (the last
+observations are in ``info["final_obs"]``), in the next, or by a reset with ``options={"reset_mask": ...}``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from jaxtyping import Bool, Float
+
+from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action
+from hipg_bench.env import Step
+from hipg_bench.errors import HipgError, SpecError, hint
+from hipg_bench.registry import make
+from hipg_bench.spec import TaskSpec
+
+Returned = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
+"""Observations (B, N * O), rewards, terminations, truncations (B,), infos."""
+
+
+class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """B worlds of a task; ``task_spec`` holds the task's numbers."""
+
+    def __init__(
+        self,
+        task: str | TaskSpec,
+        num_envs: int = 1,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        seed: int = 0,
+        threads: int = 0,
+        **overrides: Any,
+    ) -> None:
+        """Build the worlds.
+
+        Args:
+            task: a name, or a spec of your own.
+            num_envs: B.
+            autoreset_mode: when a world goes on with its next episode.
+            seed: of the first episodes; a reset with a seed replaces it.
+            threads: physics threads; 0 for all cores. Results do not depend on it.
+            **overrides: as for `hipg_bench.make`.
+
+        Raises:
+            UnknownNameError, SpecError: an argument that is not allowed.
+        """
+        self._mode = _checked(autoreset_mode)
+        at_once = self._mode is AutoresetMode.SAME_STEP
+        self._env = env = make(task, num_envs, seed, threads=threads, autoreset=at_once, **overrides)
+        self.task_spec, self.num_envs = env.spec, num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": self._mode}
+        self.single_observation_space, self.single_action_space = joint_spaces(env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._ended = np.empty(0, np.int64)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start the next episodes, with a seed world b's is episode b of that seed.
+
+        Args:
+            seed: one for all worlds.
+            options: ``reset_mask`` (B,) bool, the worlds to start; all by default.
+
+        Raises:
+            HipgError: another mask.
+        """
+        super().reset(seed=seed)
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
+        if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise HipgError(
+                f"{self.task_spec.task}: a bool array of shape {(self.num_envs,)} is allowed as reset_mask, "
+                f"got {mask!r}"
+            )
+        step = self._env.reset(worlds=np.flatnonzero(mask), seed=seed)
+        self._ended = self._ended[~mask[self._ended]]
+        return self._flat(step.observation), _masked(joint_info(step), np.ones(self.num_envs, bool))
+
+    def step(self, actions: Float[np.ndarray, "B NA"]) -> Returned:
+        """Advance every world by one control step; actions for worlds that begin in it are ignored.
+
+        Raises:
+            HipgError: a world whose episode is over, without automatic reset, or has not begun.
+            ActionError: not (B, N * A) numbers, or one for a live agent that is not finite.
+        """
+        action = split_action(self._env, actions, (self.num_envs,))
+        step = self._begin(action) if len(self._ended) else self._env.step(action)
+        done, info = step.terminated | step.truncated, joint_info(step)
+        if self._mode is AutoresetMode.NEXT_STEP:
+            self._ended = np.flatnonzero(done)
+        told = _masked(info, np.ones(self.num_envs, bool))
+        if self._mode is AutoresetMode.SAME_STEP and done.any():
+            told |= self._last(step, done)
+        return self._flat(step.observation), step.reward, step.terminated, step.truncated, told
+
+    def close_extras(self, **_: Any) -> None:
+        """Refuse further use."""
+        self._env.close()
+
+    def _begin(self, action: Float[np.ndarray, "B N A"]) -> Step:
+        """Advance the worlds that are under way, start the others: they stand still in this step."""
+        env, ids = self._env, self._ended
+        env.reset(worlds=ids)
+        rows = env.rows[ids]
+        step = env.step(np.where(np.isin(np.arange(self.num_envs), ids)[:, None, None], 0.0, action))
+        begun = env.load_rows(ids, rows)
+        now, start = joint_info(step), joint_info(begun)
+        for array, first in [(step.observation, begun.observation), *((now[k], start[k]) for k in now)]:
+            array[ids] = first[ids]
+        step.reward[ids], step.terminated[ids], step.truncated[ids] = 0.0, False, False
+        return step
+
+    def _last(self, step: Step, done: Bool[np.ndarray, "B"]) -> dict[str, Any]:
+        """What the episodes that just ended showed last, as Gymnasium's own vector environments tell it."""
+        final = self._flat(step.info["final_observation"])
+        seen = np.full(self.num_envs, None, object)
+        seen[done] = np.fromiter(final[done], object, int(done.sum()))
+        info = {**joint_info(step), "state": step.info["final_state"], "alive": step.info["final_alive"]}
+        return _masked({"final_obs": seen, "final_info": _masked(info, done)}, done)
+
+    def _flat(self, observation: Float[np.ndarray, "B N O"]) -> Float[np.ndarray, "B NO"]:
+        return observation.reshape(self.num_envs, -1)
+
+
+def _masked(info: dict[str, Any], has: Bool[np.ndarray, "B"]) -> dict[str, Any]:
+    """Each entry with its mask, the worlds that have it, as Gymnasium wants it."""
+    return {**info, **{f"_{name}": has for name in info}}
+
+
+def _checked(mode: AutoresetMode | str) -> AutoresetMode:
+    if mode not in [*AutoresetMode, *(each.value for each in AutoresetMode)]:
+        names = [each.value for each in AutoresetMode]
+        raise SpecError(f"autoreset_mode = {mode!r} is refused{hint(str(mode), names)}")
+    return AutoresetMode(mode)

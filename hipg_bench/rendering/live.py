@@ -1,0 +1,220 @@
+"""One world shown while it is played: a picture when asked, or a window.
+
+OpenGL lives in a child process, which is this module, ``python -m hipg_bench.rendering.live``: it can choose
+its backend whatever the process that plays has imported, and a broken driver cannot take that down. Rows go
+in through its standard input, each message led by their number and size; through its standard output come a
+picture's bytes, or one byte when the window takes a row.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import select
+import struct
+import subprocess
+import sys
+import tempfile
+import weakref
+from collections.abc import Iterator
+from typing import IO, Literal, cast
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from hipg_bench.errors import HipgError, RenderError
+from hipg_bench.rendering import gl
+from hipg_bench.spec import Params, TaskSpec
+
+SIZE = (640, 360)
+"""Width and height of pictures."""
+
+_HEAD = struct.Struct("<II")
+"""How many rows, and of how many numbers."""
+_STALL = 120.0
+"""Seconds without an answer after which the child counts as hung."""
+
+
+class Job(Params):
+    """What the child must know before the first row.
+
+    Attributes:
+        spec: the task.
+        mode: what to show.
+    """
+
+    spec: TaskSpec
+    mode: Literal["human", "rgb_array"]
+
+
+class Live:
+    """Shows one world; its child starts with the first picture and ends with `close`."""
+
+    def __init__(self, spec: TaskSpec, mode: str) -> None:
+        """Prepare, without OpenGL as yet.
+
+        Raises:
+            RenderError: no such mode, or a window where there is no display.
+        """
+        if mode not in ("human", "rgb_array"):
+            raise RenderError(f"{spec.task}: render modes 'human' and 'rgb_array' are allowed, got {mode!r}")
+        if mode == "human":
+            from hipg_bench.rendering.viewer import check_display
+
+            check_display()
+        self._job = Job(spec=spec, mode=mode)
+        self._unseen: list[Float[np.ndarray, "R"]] = []
+        self._child: _Child | None = None
+        self._shut = False
+
+    def begin(self, row: Float[np.ndarray, "R"]) -> None:
+        """An episode starts: forget what nobody asked to see of the last one."""
+        self._unseen.clear()
+        self.see(row)
+
+    def see(self, row: Float[np.ndarray, "R"]) -> None:
+        """The world after a control step; a window shows it, at the pace of the world, until it is closed."""
+        self._unseen.append(row)
+        if self._job.mode == "human" and not self._shut:
+            self._shut = not self._ask(1)
+
+    def picture(self) -> UInt8[np.ndarray, "height width 3"]:
+        """The world as it was last seen.
+
+        Raises:
+            RenderError: no OpenGL works here, or the child failed.
+        """
+        width, height = SIZE
+        return np.frombuffer(self._ask(width * height * 3), np.uint8).reshape(height, width, 3).copy()
+
+    def close(self) -> None:
+        """End the child."""
+        if self._child:
+            self._child.end()
+        self._child, self._shut = None, True
+
+    def _ask(self, size: int) -> bytes:
+        """Send the rows that the child has not seen; its answer, empty where its window was closed."""
+        self._child = self._child or _Child(self._job)
+        rows = np.stack(self._unseen) if self._unseen else np.empty((0, 0))
+        self._unseen.clear()
+        return self._child.ask(_HEAD.pack(*rows.shape) + rows.tobytes(), size)
+
+
+class _Child:
+    """The process that draws, as seen by the one that plays; it ends with this object."""
+
+    def __init__(self, job: Job) -> None:
+        # a window takes the desktop's OpenGL, pictures the first that works without one
+        backend = "glfw" if job.mode == "human" else gl.working_backend()
+        if backend is None:
+            raise RenderError(
+                f"{job.spec.task}: no OpenGL works, neither {' nor '.join(gl.BACKENDS)}: run\n  {gl.MEND}"
+            )
+        self._where = f"{job.spec.task}: {backend}"
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __spec__.name, job.model_dump_json()],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, env=gl.environment(backend),
+        )  # fmt: skip
+        self._mouth = cast("IO[bytes]", self._process.stdin)
+        self._ear = cast("IO[bytes]", self._process.stdout)
+        self.end = weakref.finalize(self, _end, self._process, self._mouth, self._ear, self._stderr)
+
+    def ask(self, message: bytes, size: int) -> bytes:
+        """Send a message; the answer of ``size`` bytes, or nothing where the child ended in peace.
+
+        Raises:
+            RenderError: it failed, with its last words, or hangs.
+        """
+        with contextlib.suppress(BrokenPipeError):
+            self._mouth.write(message)
+            self._mouth.flush()
+        answer = bytearray()
+        while len(answer) < size:
+            if not select.select([self._ear], [], [], _STALL)[0]:
+                raise RenderError(f"{self._where}: no picture within {_STALL:.0f} s; the driver hangs")
+            part = os.read(self._ear.fileno(), size - len(answer))
+            if not part:
+                return self._last_words()
+            answer += part
+        return bytes(answer)
+
+    def _last_words(self) -> bytes:
+        code = self._process.wait()
+        if code == 0:
+            return b""
+        self._stderr.seek(0)
+        why = gl.last_words(self._stderr.read().decode(errors="replace"), code)
+        raise RenderError(f"{self._where}: nothing can be shown: {why}\nIf OpenGL is missing: {gl.MEND}")
+
+
+def _end(process: subprocess.Popen[bytes], *files: IO[bytes]) -> None:
+    process.kill()
+    process.wait()
+    for file in files:
+        with contextlib.suppress(BrokenPipeError):
+            file.close()
+
+
+def _messages() -> Iterator[Float[np.ndarray, "k R"]]:
+    """What the parent sends, until it is gone."""
+    while head := sys.stdin.buffer.read(_HEAD.size):
+        count, size = _HEAD.unpack(head)
+        yield np.frombuffer(sys.stdin.buffer.read(count * size * 8)).reshape(count, size)
+
+
+def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
+    """Answer each message with a picture, written on as in films."""
+    # graphics are touched here and in the child only
+    from hipg_bench.rendering.hud import Caption, Hud, Reading
+    from hipg_bench.rendering.motion import Footage
+    from hipg_bench.rendering.painter import Painter
+    from hipg_bench.rendering.scene import Stage
+
+    messages = _messages()
+    first = next(messages)
+    footage = Footage(spec, first[:1])
+    stage = Stage(footage)
+    duration = spec.horizon * spec.control_step
+    hud = Hud(Caption(spec.task, "", stage.legend, 1.0, duration, stage.cast.colour), *SIZE)
+    with Painter(stage, *SIZE) as painter:
+        for rows in itertools.chain([first[1:]], messages):
+            for row in rows:
+                footage.append(row)
+            time = float(footage.time[-1])
+            frame, camera, labels, status = painter.paint(time)
+            now = footage.remembered(time)
+            reading = Reading(time, float(now["return"][0]), now["health"], status)
+            out.write(hud.write(frame, camera, labels, reading).tobytes())
+            out.flush()
+
+
+def _taken(out: IO[bytes]) -> Iterator[Float[np.ndarray, "R"]]:
+    """Rows one by one, each acknowledged when the window asks for it."""
+    for rows in _messages():
+        for row in rows:
+            out.write(b"+")
+            out.flush()
+            yield row
+
+
+def _main() -> None:
+    job = Job.model_validate_json(sys.argv[1])
+    # what libraries print must not get between the answers
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    if job.mode == "rgb_array":
+        _draw(job.spec, out)
+    else:
+        from hipg_bench.rendering.viewer import watch
+
+        watch(job.spec, _taken(out))
+
+
+if __name__ == "__main__":
+    try:
+        _main()
+    except HipgError as error:
+        sys.exit(f"{type(error).__name__}: {error}")
