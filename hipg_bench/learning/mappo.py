@@ -22,6 +22,7 @@ from torch import Tensor
 
 from hipg_bench.env import BatchEnv, Step
 from hipg_bench.errors import ResumeError
+from hipg_bench.layout import TaskLayout
 from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
@@ -31,6 +32,8 @@ from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
 """Bounds of the actor's learning rate."""
+_LOSE_EVERY = 5
+"""Steps between two chances of a spontaneous death; each costs another look at all worlds."""
 
 
 @dataclasses.dataclass
@@ -65,22 +68,7 @@ class Trainer:
             threads=torch.get_num_threads(),
             weights=settings.weights,
         )
-        layout = self.env.layout
-        self.actor = Actor(
-            self.env.observation_size,
-            self.env.action_size,
-            settings.actor_hidden,
-            settings.std,
-            normalize=settings.normalize_inputs,
-        )
-        local = settings.arm == "local"
-        self.critic = Critic(
-            self.env.observation_size if local else self.env.state_size,
-            settings.critic_hidden,
-            np.empty(0, np.int64) if local else layout.health_columns,
-            normalize=settings.normalize_inputs,
-            normalize_returns=settings.normalize_returns,
-        )
+        self.actor, self.critic = networks(settings, self.env.layout)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, eps=1e-5)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, eps=1e-5)
         self.iteration = 0
@@ -120,6 +108,9 @@ class Trainer:
             episodes=[],
         )
         for t in range(T):
+            lost = self._lose_some() if settings.spontaneous_deaths and t % _LOSE_EVERY == 0 else None
+            if lost is not None and t > 0:
+                data.done[t - 1] |= lost  # what was learned before must not pay for it
             was = self.step
             data.observation[t] = torch.from_numpy(was.observation)
             data.state[t] = torch.from_numpy(was.info["state"])
@@ -140,6 +131,23 @@ class Trainer:
             for b in np.flatnonzero(data.done[t].numpy()):
                 data.episodes.append({name: float(values[b]) for name, values in now.info["metrics"].items()})
         return data
+
+    def _lose_some(self) -> Bool[Tensor, "B"]:
+        """Kill agents without a cause; returns the worlds in which it happened.
+
+        The critic is asked about teams without agent i; this way it has met such teams.
+        """
+        env = self.env
+        chance = self.settings.spontaneous_deaths * _LOSE_EVERY / (env.spec.horizon * env.num_agents)
+        struck = torch.rand(env.num_envs, env.num_agents) < chance
+        worlds = torch.nonzero(struck.any(1))[:, 0].numpy()
+        if len(worlds):
+            rows = env.rows
+            for agent in range(env.num_agents):
+                chosen = struck[:, agent].numpy()
+                rows[chosen] = env.fork(rows[chosen], {agent: 0.0})
+            self.step = env.load_rows(worlds, rows[worlds])
+        return struck.any(1)
 
     @torch.no_grad()
     def assign_credit(self, data: Rollout) -> tuple[Float[Tensor, "T B K"], Float[Tensor, "T B N"]]:
@@ -274,13 +282,14 @@ class Trainer:
             ResumeError: the checkpoint is of a run with other settings.
         """
         content = torch.load(path, weights_only=True)
-        saved = json.loads(content["settings"])
-        own = json.loads(self.settings.model_dump_json())
-        changed = {key for key in own if own[key] != saved.get(key)} - {"steps"}
+        # a run of an older version has today's defaults in what that version did not know
+        saved = Settings(**json.loads(content["settings"])).model_dump()
+        own = self.settings.model_dump()
+        changed = {key for key in own if own[key] != saved[key]} - {"steps"}
         if changed:
             key = min(changed)
             raise ResumeError(
-                f"{path} was trained with {key} = {saved.get(key)!r}, not {own[key]!r}: choose another --out"
+                f"{path} was trained with {key} = {saved[key]!r}, not {own[key]!r}: choose another --out"
             )
         self.iteration = content["iteration"]
         self.actor.load_state_dict(content["actor"])
@@ -289,6 +298,26 @@ class Trainer:
         self.critic_optimizer.load_state_dict(content["critic_optimizer"])
         self.step = self.env.load_rows(np.arange(self.env.num_envs), content["worlds"].numpy())
         torch.set_rng_state(content["random"])
+
+
+def networks(settings: Settings, layout: TaskLayout) -> tuple[Actor, Critic]:
+    """Fresh actor and critic for a run."""
+    actor = Actor(
+        layout.observation.size,
+        layout.action.size,
+        settings.actor_hidden,
+        settings.std,
+        normalize=settings.normalize_inputs,
+    )
+    local = settings.arm == "local"
+    critic = Critic(
+        layout.observation.size if local else layout.state.size,
+        settings.critic_hidden,
+        np.empty(0, np.int64) if local else layout.health_columns,
+        normalize=settings.normalize_inputs,
+        normalize_returns=settings.normalize_returns,
+    )
+    return actor, critic
 
 
 def surrogate(change: Float[Tensor, "X"], psi: Float[Tensor, "X"], clip: float) -> Float[Tensor, ""]:

@@ -45,6 +45,8 @@ class Settings(Params):
         normalize_inputs, normalize_returns: running normalisation of what networks see, of value targets.
         bootstrap_truncation: an episode cut by the horizon goes on in its value target; else the
             horizon counts as an end, as in the authors' code.
+        spontaneous_deaths: agents per episode, in the mean, that die without a cause, in training only,
+            so that the critic meets the states its counterfactual is about.
     """
 
     task: str
@@ -74,6 +76,7 @@ class Settings(Params):
     normalize_inputs: bool = True
     normalize_returns: bool = True
     bootstrap_truncation: bool = True
+    spontaneous_deaths: float = pydantic.Field(default=0.0, ge=0, le=10)
 
     @property
     def iterations(self) -> int:

@@ -1,0 +1,239 @@
+"""How right a learned counterfactual is: V(s with agent i dead) against worlds in which agent i is dead.
+
+The min-health baseline asks the critic about states that training hardly visits. State rows make the
+true answer measurable: fork a world, kill agent i in the fork, let the same policy finish the episode
+many times with fresh luck, and average the discounted returns.
+
+Value targets bootstrap at the horizon (`Settings.bootstrap_truncation`), so that what the critic has
+learned goes on beyond it; then the true worlds do so too, until what follows is discounted to 1 %.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hipg_bench.env import BatchEnv
+from hipg_bench.errors import HipgError
+from hipg_bench.learning.credit import with_each_dead
+from hipg_bench.learning.mappo import networks
+from hipg_bench.learning.networks import Actor, Critic
+from hipg_bench.learning.settings import Settings
+from hipg_bench.registry import family_of, make, task_spec
+from hipg_bench.spec import parse
+
+_MOST_WORLDS = 2048
+"""Worlds that are rolled out side by side."""
+_NEGLIGIBLE = 0.01
+"""Discount at which what follows is left out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """A learned quantity beside its true value, over K cases.
+
+    Attributes:
+        learned: (K,) what the critic says, in units of reward.
+        true: (K,) mean discounted return of ``repeats`` rollouts.
+        noise: standard error of the true values' means, averaged over the cases.
+    """
+
+    learned: Float[np.ndarray, "K"]
+    true: Float[np.ndarray, "K"]
+    noise: float
+
+    @property
+    def bias(self) -> float:
+        """Mean of learned minus true."""
+        return float((self.learned - self.true).mean())
+
+    @property
+    def error(self) -> float:
+        """Root mean square of learned minus true."""
+        return float(np.sqrt(((self.learned - self.true) ** 2).mean()))
+
+    @property
+    def correlation(self) -> float:
+        """Pearson's; NaN where either side does not vary."""
+        if self.learned.std() == 0 or self.true.std() == 0:
+            return float("nan")
+        return float(np.corrcoef(self.learned, self.true)[0, 1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Audit:
+    """What an audit found.
+
+    Attributes:
+        value: V(s) against the return from s.
+        counterfactual: V(s with only h_i := 0) against the return from the world in which i is dead.
+        credit: V(s) - V(s with only h_i := 0) against the difference of the two returns: what agent i's
+            life is worth.
+        dead_share: (N + 1,) share of the visited states with k dead, k = 0..N.
+        cases: how many pairs of state and live agent were compared.
+        repeats: rollouts per case and side.
+    """
+
+    value: Comparison
+    counterfactual: Comparison
+    credit: Comparison
+    dead_share: Float[np.ndarray, "M"]
+    cases: int
+    repeats: int
+
+
+def audit(
+    actor: Actor,
+    critic: Critic,
+    settings: Settings,
+    *,
+    worlds: int = 32,
+    moments: int = 5,
+    repeats: int = 8,
+    seed: int = 500,
+) -> Audit:
+    """Compare a learned critic's counterfactuals with true ones.
+
+    Args:
+        actor: the policy, exploring as in training: its values are what the critic has learned.
+        critic: of the joint state.
+        settings: of the run; ``gamma`` discounts, ``weights`` price.
+        worlds: episodes that states are taken from.
+        moments: states per episode, evenly spread over the horizon.
+        repeats: rollouts per case, each with luck of its own.
+        seed: of the episodes and of all luck.
+    """
+    torch.manual_seed(seed)
+    chance = np.random.default_rng(seed)
+    env = make(settings.task, worlds, seed, weights=settings.weights)
+    rows, dead_share = _visit(env, actor, moments)
+    n = env.num_agents
+    alive = env.recall(rows, "health") > 0
+    case, victim = np.nonzero(alive)
+    forks = rows[case]
+    for agent in range(n):
+        chosen = victim == agent
+        forks[chosen] = env.fork(forks[chosen], {agent: 0.0})
+
+    value, without = _learned(env, critic, rows)
+    base, base_noise = _true(actor, settings, rows, repeats, chance)
+    fork, fork_noise = _true(actor, settings, forks, repeats, chance)
+    return Audit(
+        value=Comparison(value, base, base_noise),
+        counterfactual=Comparison(without[case, victim], fork, fork_noise),
+        credit=Comparison(
+            value[case] - without[case, victim], base[case] - fork, float(np.hypot(base_noise, fork_noise))
+        ),
+        dead_share=dead_share,
+        cases=len(case),
+        repeats=repeats,
+    )
+
+
+def load(run: Path) -> tuple[Actor, Critic, Settings]:
+    """Read the networks of a training run of one's own.
+
+    Raises:
+        HipgError: the folder holds no checkpoint, or its critic does not see the joint state.
+    """
+    path = run / "checkpoint.pt"
+    if not path.exists():
+        raise HipgError(f"{run} holds no checkpoint.pt: an audit needs the critic of a training run")
+    content = torch.load(path, weights_only=True)
+    settings = parse(Settings, json.loads(content["settings"]), str(path))
+    if settings.arm == "local":
+        raise HipgError(f"{run}: a local critic cannot be asked about the health of others (arm local)")
+    actor, critic = networks(settings, family_of(task_spec(settings.task)).layout)
+    actor.load_state_dict(content["actor"])
+    critic.load_state_dict(content["critic"])
+    return actor, critic, settings
+
+
+def redraw_luck(env: BatchEnv, rows: Float[np.ndarray, "X R"], chance: np.random.Generator) -> None:
+    """Draw anew, in place, how much more each agent can take.
+
+    Toughness is exponential: given that the exposure so far killed nobody who lives, what is left of
+    it is exponential again.
+    """
+    exposure = env.recall(rows, "exposure")
+    env.recall(rows, "toughness")[:] = exposure + chance.exponential(size=exposure.shape)
+
+
+@torch.no_grad()
+def _visit(
+    env: BatchEnv, actor: Actor, moments: int
+) -> tuple[Float[np.ndarray, "K R"], Float[np.ndarray, "M"]]:
+    """Rows of states on the policy's way, and how many agents were dead in all states it saw."""
+    horizon = env.spec.horizon
+    taken = {round((k + 0.5) * horizon / moments) for k in range(moments)}
+    step, rows = env.reset(), list[np.ndarray]()
+    dead = np.zeros(env.num_agents + 1)
+    for t in range(horizon):
+        if t in taken:
+            rows.append(env.rows)
+        dead += np.bincount((~step.info["alive"]).sum(axis=1), minlength=len(dead))
+        step = env.step(actor(torch.from_numpy(step.observation)).sample().numpy())
+    return np.concatenate(rows), dead / dead.sum()
+
+
+@torch.no_grad()
+def _learned(
+    env: BatchEnv, critic: Critic, rows: Float[np.ndarray, "K R"]
+) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K N"]]:
+    """V(s), and V(s with only h_i := 0) for every agent i."""
+    layout = env.layout
+    values: list[np.ndarray] = []
+    for some in np.split(rows, len(rows) // env.num_envs):
+        info = env.load_rows(np.arange(env.num_envs), some).info
+        state = torch.from_numpy(info["state"])
+        copies = with_each_dead(state, layout.health_columns, layout.dead_value)
+        asked = torch.cat([state[:, None], copies], dim=1)
+        elapsed = torch.from_numpy(info["elapsed"] / env.spec.horizon).float()
+        values.append(critic(asked, elapsed[:, None].expand(asked.shape[:2])).numpy())
+    value = np.concatenate(values)
+    return value[:, 0], value[:, 1:]
+
+
+@torch.no_grad()
+def _true(
+    actor: Actor,
+    settings: Settings,
+    rows: Float[np.ndarray, "K R"],
+    repeats: int,
+    chance: np.random.Generator,
+) -> tuple[Float[np.ndarray, "K"], float]:
+    """Mean discounted return from every row over ``repeats`` rollouts, and its mean standard error."""
+    copies = np.repeat(rows, repeats, axis=0)
+    returns = np.concatenate([
+        _returns(actor, settings, some, chance)
+        for some in np.array_split(copies, math.ceil(len(copies) / _MOST_WORLDS))
+    ]).reshape(len(rows), repeats)  # fmt: skip
+    return returns.mean(axis=1), float((returns.std(axis=1, ddof=1) / math.sqrt(repeats)).mean())
+
+
+def _returns(
+    actor: Actor, settings: Settings, rows: Float[np.ndarray, "X R"], chance: np.random.Generator
+) -> Float[np.ndarray, "X"]:
+    """Discounted return from every row to the end of its episode, with fresh luck."""
+    horizon = task_spec(settings.task).horizon
+    if settings.bootstrap_truncation and settings.gamma < 1:
+        horizon += math.ceil(math.log(_NEGLIGIBLE) / math.log(max(settings.gamma, 1e-9)))
+    env = make(settings.task, len(rows), weights=settings.weights, horizon=horizon)
+    rows = rows.copy()
+    redraw_luck(env, rows, chance)
+    step = env.load_rows(np.arange(len(rows)), rows)
+    total, discount, running = np.zeros(len(rows)), 1.0, np.ones(len(rows), bool)
+    for _ in range(horizon):
+        step = env.step(actor(torch.from_numpy(step.observation)).sample().numpy())
+        total += np.where(running, discount * step.reward, 0.0)
+        running &= ~(step.terminated | step.truncated)
+        discount *= settings.gamma
+        if discount < _NEGLIGIBLE or not running.any():
+            break
+    return total

@@ -1,0 +1,94 @@
+"""The audit's true counterfactuals, against plain loops and cases whose answer is known."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hipg_bench import make
+from hipg_bench.errors import HipgError
+from hipg_bench.learning import audit
+from hipg_bench.learning.mappo import networks
+from hipg_bench.learning.run import train
+from hipg_bench.learning.settings import Settings, recommended
+
+SMALL = {"num_envs": 8, "rollout": 10, "steps": 80, "actor_hidden": (16,), "critic_hidden": (16,)}
+
+
+def quiet(settings: Settings) -> tuple[torch.nn.Module, torch.nn.Module]:
+    """Networks whose policy hardly explores."""
+    torch.manual_seed(3)
+    actor, critic = networks(settings, make(settings.task).layout)
+    with torch.no_grad():
+        actor.log_std.fill_(math.log(1e-6))
+    return actor, critic
+
+
+def test_comparison_by_hand() -> None:
+    # learned - true: 1, 1, -1: mean 1/3, root mean square 1; both sides (1,2,0), (0,1,1):
+    # deviations (0,1,-1) and (-2/3,1/3,1/3): covariance 0
+    found = audit.Comparison(np.array([1.0, 2.0, 0.0]), np.array([0.0, 1.0, 1.0]), 0.0)
+    assert found.bias == pytest.approx(1 / 3)
+    assert found.error == pytest.approx(1.0)
+    assert found.correlation == pytest.approx(0.0, abs=1e-12)
+
+
+def test_true_returns_are_those_of_a_plain_loop() -> None:
+    settings = recommended("coop_nav-3", gamma=0.9, bootstrap_truncation=False)
+    actor, _ = quiet(settings)
+    env = make("coop_nav-3", 3, seed=5)
+    step = env.reset()
+    for _ in range(7):
+        step = env.step(np.zeros((3, 3, 3)))
+    rows = env.rows
+    mean, noise = audit._true(actor, settings, rows, 2, np.random.default_rng(0))
+    total = np.zeros(3)
+    for k in range(env.spec.horizon - 7):
+        if 0.9**k < 0.01:
+            break
+        action = actor(torch.from_numpy(step.observation)).mean.detach().numpy()
+        step = env.step(action)
+        total += 0.9**k * step.reward
+    np.testing.assert_allclose(mean, total, rtol=1e-3)
+    assert noise < 1e-3, "nothing but exploration differs between the repeats"
+
+
+def test_the_dead_are_dead_in_the_true_counterfactual() -> None:
+    """All dead from the start: every point is charged the full distance, whatever the drones do."""
+    settings = recommended("hazard_nav-4", gamma=0.9, bootstrap_truncation=False)
+    actor, _ = quiet(settings)
+    env = make("hazard_nav-4", 2, seed=5)
+    env.reset()
+    rows = env.fork(env.rows, dict.fromkeys(range(4), 0.0))
+    mean, _ = audit._true(actor, settings, rows, 2, np.random.default_rng(0))
+    # sum of 0.9^k while it is at least 0.01 (k <= 43), times the charge of a point nobody watches
+    nobody = float(env.spec.params["nobody"]) * env.spec.weights["distance"]
+    np.testing.assert_allclose(mean, nobody * sum(0.9**k for k in range(44)), rtol=1e-6)
+
+
+def test_luck_is_drawn_anew_for_every_repeat() -> None:
+    """A drone that stays in a deadly place dies in some repeats and lives in others."""
+    settings = recommended("hazard_nav-4", bootstrap_truncation=False)
+    env = make("hazard_nav-4", 1, seed=1, hazard_radius=3.0, hazard_peak=0.02)
+    env.reset()
+    rows = np.repeat(env.rows, 400, axis=0)
+    toughness = env.recall(rows, "toughness")
+    before = toughness.copy()
+    audit.redraw_luck(env, rows, np.random.default_rng(0))
+    assert np.unique(toughness[:, 0]).size == 400
+    # exponential again: mean 1 above what was already borne
+    assert abs((toughness - env.recall(rows, "exposure")).mean() - 1) < 0.1
+    assert (before == before[0]).all()
+    assert settings.task == env.spec.task
+
+
+def test_an_audit_of_a_run(tmp_path: Path) -> None:
+    train(recommended("hazard_nav-4", **SMALL), tmp_path, command="test")
+    found = audit.audit(*audit.load(tmp_path), worlds=4, moments=2, repeats=2)
+    assert found.dead_share.sum() == pytest.approx(1.0)
+    assert found.cases <= 4 * 2 * 4
+    assert len(found.credit.learned) == found.cases
+    with pytest.raises(HipgError, match="checkpoint"):
+        audit.load(tmp_path / "nowhere")
