@@ -10,6 +10,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hipg_bench import episode
+from hipg_bench.episode import NEVER, memory_fields
 from hipg_bench.errors import ActionError, HipgError
 from hipg_bench.families.family import Family
 from hipg_bench.families.scene import without_visuals
@@ -17,19 +19,6 @@ from hipg_bench.layout import TaskLayout
 from hipg_bench.mechanics import health as health_law
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec
-
-NEVER = -1.0
-"""Death time of the living."""
-
-
-def memory_fields(spec: TaskSpec, family: Family) -> dict[str, int]:
-    """What an episode remembers: name to how many numbers, in the order of ``userdata``."""
-    n = spec.num_agents
-    common = {
-        "health": n, "exposure": n, "toughness": n, "death_time": n, "death_cause": n,
-        "episode_id": 1, "elapsed": 1, "return": 1,
-    }  # fmt: skip
-    return {**common, **family.fields}
 
 
 def world_model(spec: TaskSpec, family: Family, *, visual: bool = False) -> mujoco.MjModel:
@@ -98,7 +87,7 @@ class BatchEnv:
         self.action_size = family.layout.action.size
         self.observation_size = family.layout.observation.size
         self.state_size = family.layout.state.size
-        self.metrics = ("return", "length", "survival", "deaths", "first_death", *family.metrics)
+        self.metrics = (*episode.METRICS, *family.metrics)
         self.decimation = family.physics_steps
         self.model = world_model(spec, family)
         self._sim = Sim(
@@ -165,23 +154,24 @@ class BatchEnv:
         # the world moves; the dead exert no force
         if self.spec.graded_health:
             action = action * field["health"][:, :, None]
-        family.act(sim, action)
-        sim.disable(field["health"] == 0)
+        family.act(sim, was, action)
         diverged = sim.advance()
         now = family.read(sim)
 
         # harm becomes death
-        harm = family.harm(was, now)
-        health, field["exposure"][:] = health_law.damage(
-            field["health"], field["exposure"], field["toughness"], harm.exposure, harm.fatal,
-            graded=self.spec.graded_health,
-        )  # fmt: skip
         field["elapsed"] += 1
-        died = (health == 0) & (field["health"] > 0)
-        np.copyto(field["death_time"], field["elapsed"], where=died)
-        np.copyto(field["death_cause"], harm.cause, where=died)
-        field["health"][:] = health
-        now = family.remember(sim, was, dataclasses.replace(now, health=health))
+        harm = family.harm(was, now)
+        if not harm.none:
+            health, field["exposure"][:] = health_law.damage(
+                field["health"], field["exposure"], field["toughness"], harm.exposure, harm.fatal,
+                graded=self.spec.graded_health,
+            )  # fmt: skip
+            died = (health == 0) & (field["health"] > 0)
+            np.copyto(field["death_time"], field["elapsed"], where=died)
+            np.copyto(field["death_cause"], harm.cause, where=died)
+            field["health"][:] = now.health[:] = health
+            sim.disable(health == 0)
+        now = family.remember(sim, was, now)
 
         # the team is paid, and told how it ended
         terms = {name: self.spec.weights[name] * term for name, term in family.reward(was, now).items()}
@@ -192,25 +182,28 @@ class BatchEnv:
         # one after another: NumPy may pair the summands by the number of worlds, which changes last bits
         reward = sum(terms.values(), np.zeros(self.num_envs))
         field["return"][:, 0] += reward
-        end_reason = np.select([diverged, ruled, truncated], ["physics", reason, "horizon"], "")
+        done = terminated | truncated
+        (ended,) = done.nonzero()
+        end_reason = np.full(self.num_envs, "")
+        if len(ended):
+            end_reason = np.select([diverged, ruled, truncated], ["physics", reason, "horizon"], "")
 
         # what was seen, then the next episode where this one is over
         observation, state = self._perceive(now)
-        done = terminated | truncated
         info: dict[str, Any] = {
-            "final_observation": observation, "final_state": state, "final_alive": health > 0,
-            "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, np.flatnonzero(done)),
+            "final_observation": observation, "final_state": state, "final_alive": now.health > 0,
+            "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, ended),
+            "final_rows": sim.rows[ended],
         }  # fmt: skip
         observation, state = observation.copy(), state.copy()
-        info["final_rows"] = self._sim.rows[done]
-        if self._autoreset and done.any():
-            ids = np.flatnonzero(done)
-            self._begin(ids, self._next_episode + np.arange(len(ids)))
-            observation[ids], state[ids] = self._perceive(family.read(sim, ids))
-            self._now = family.read(sim)
+        if len(ended) and self._autoreset:
+            self._begin(ended, self._next_episode + np.arange(len(ended)))
+            fresh = family.read(sim, ended)
+            observation[ended], state[ended] = self._perceive(fresh)
+            self._now = fresh if len(ended) == self.num_envs else family.read(sim)
         else:
             self._now, self._waiting = now, done
-        return Step(observation, reward, terminated, truncated, {**info, **self._present(state)})
+        return Step(observation, reward, terminated, truncated, info | self._present(state))
 
     @property
     def rows(self) -> Float[np.ndarray, "B R"]:
@@ -270,12 +263,8 @@ class BatchEnv:
 
     def _begin(self, ids: Int[np.ndarray, "n"], episodes: Int[np.ndarray, "n"]) -> None:
         """Start episodes in worlds ``ids``: all chance of an episode is drawn here."""
-        n, size = self.num_agents, self.num_agents + self.family.chance_size
-        # the episode takes the counter's highest word: draws advance the lowest, so streams never meet
-        chance = np.stack([
-            np.random.Generator(np.random.Philox(key=self._seed, counter=[0, 0, 0, episode])).random(size)
-            for episode in episodes.tolist()
-        ])  # fmt: skip
+        n = self.num_agents
+        chance = episode.draw(self._seed, episodes, n + self.family.chance_size)
         self._sim.reset(ids)
         field = self._sim.field
         field["health"][ids] = 1.0
@@ -288,6 +277,7 @@ class BatchEnv:
     def _resume(self, ids: Int[np.ndarray, "n"]) -> Step:
         """Look at the worlds as they stand; ``ids`` are ready to go on."""
         self._waiting[ids] = False
+        self._sim.disable(self._sim.field["health"] == 0)
         self._now = self.family.read(self._sim)
         observation, state = self._perceive(self._now)
         nothing = np.zeros(self.num_envs, bool)
@@ -324,20 +314,10 @@ class BatchEnv:
 
     def _measure(self, now: Any, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "B"]]:
         """Metrics of the episodes that end in worlds ``ids``; NaN elsewhere."""
-        out = {name: np.full(self.num_envs, np.nan) for name in self.metrics}
+        out = dict(zip(self.metrics, np.full((len(self.metrics), self.num_envs), np.nan), strict=True))
         if len(ids):
-            field = self._sim.field
-            died_at = field["death_time"][ids]
-            dead = died_at != NEVER
-            length = field["elapsed"][ids, 0]
-            out["return"][ids] = field["return"][ids, 0]
-            out["length"][ids] = length
-            out["survival"][ids] = 1.0 - dead.mean(axis=1)
-            out["deaths"][ids] = dead.sum(axis=1)
-            # undefined (NaN) where nobody died
-            first = np.where(dead, died_at, np.inf).min(axis=1)
-            out["first_death"][ids] = np.where(np.isfinite(first), first, np.nan)
-            for name, value in self.family.measure(self._sim, ids, now).items():
+            told = episode.measure(self._sim.field, ids) | self.family.measure(self._sim, ids, now)
+            for name, value in told.items():
                 out[name][ids] = value
         return out
 
@@ -366,16 +346,23 @@ class BatchEnv:
             raise ActionError(
                 f"{self.spec.task}: actions of shape {expected} (B, N, A) are allowed, got {action.shape}"
             )
-        alive = self._sim.field["health"][:, :, None] > 0
-        bad = alive & ~np.isfinite(action)
+        alive = self._sim.field["health"] > 0
+        # a sum is finite only if all its terms are
+        if not np.isfinite(action.sum()):
+            self._refuse_infinite(action, alive)
+        if not alive.all():
+            action = np.where(alive[:, :, None], action, 0.0)
+        return action.clip(-1.0, 1.0) if self.spec.clip_actions else action
+
+    def _refuse_infinite(self, action: Float[np.ndarray, "B N A"], alive: Bool[np.ndarray, "B N"]) -> None:
+        """Raise if somebody alive is told a number that is not finite."""
+        bad = alive[:, :, None] & ~np.isfinite(action)
         if bad.any():
             env, agent, axis = np.argwhere(bad)[0].tolist()
             raise ActionError(
                 f"{self.spec.task}: finite actions are allowed, got {action[env, agent, axis]} "
                 f"for env {env}, agent {agent} ({self.layout.action.blocks[0].name}[{axis}])"
             )
-        action = np.where(alive, action, 0.0)
-        return np.clip(action, -1.0, 1.0) if self.spec.clip_actions else action
 
     def _checked_worlds(self, worlds: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
         worlds = np.atleast_1d(np.asarray(worlds))

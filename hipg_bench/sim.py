@@ -13,14 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from mujoco.batch import Batch
 
-_BAD_PHYSICS = [
-    int(kind)
-    for kind in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    )
-]
+_BAD_PHYSICS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+"""Warnings of positions, velocities or accelerations that are not numbers, or huge."""
 
 
 class Sim:
@@ -76,6 +70,7 @@ class Sim:
         before = int(kind.mjSTATE_INTEGRATION) & (int(kind.mjSTATE_USERDATA) - 1)
         self._userdata_start = mujoco.mj_stateSize(model, before)
         self._disabled = self.batch.expand("opt.disableactuator")
+        self._bad = self.batch.warning[:, _BAD_PHYSICS, 1]
 
     @property
     def num_envs(self) -> int:
@@ -94,7 +89,7 @@ class Sim:
             pose, so that everything read from them is finite, and must be reset.
         """
         self.batch.step(nstep=self._decimation)
-        diverged = self.batch.warning[:, _BAD_PHYSICS, 1].any(axis=1)
+        diverged = self._bad.any(axis=1)
         if diverged.any():
             self.position[diverged] = self.model.qpos0
             self.velocity[diverged] = 0.0

@@ -34,14 +34,19 @@ class Harm:
     fatal: Bool[np.ndarray, "B N"]
     cause: Int[np.ndarray, "B N"]
 
+    @property
+    def none(self) -> bool:
+        """Whether nobody came to any."""
+        return not (self.exposure.any() or self.fatal.any())
+
 
 @runtime_checkable
 class Family(Protocol):
     """Physics and rules of a family, for one spec.
 
-    A ``Snapshot`` is the family's frozen dataclass of named arrays, each a copy of (n, ...); it has
-    a field ``health`` (n, N). Everything that evolves lives in the simulation's rows, so a family
-    object holds only constants.
+    A ``Snapshot`` is the family's dataclass of named arrays (n, ...), which are its own; it has a field
+    ``health`` (n, N), into which deaths of the step are written. Everything that evolves lives in the
+    simulation's rows, so a family object holds only constants.
 
     Attributes:
         layout: observation, action and joint state.
@@ -67,8 +72,8 @@ class Family(Protocol):
         """Lay out worlds ``ids`` from uniform numbers; health and toughness are already drawn."""
         ...
 
-    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
-        """Write the actuators' inputs (and forces that mechanics add)."""
+    def act(self, sim: Sim, was: Any, action: Float[np.ndarray, "B N A"]) -> None:
+        """Write the actuators' inputs (and forces that mechanics add), in the state ``was``."""
         ...
 
     def read(self, sim: Sim, rows: Rows = EVERY) -> Any:

@@ -128,7 +128,7 @@ class HazardComm:
         low, high = np.array([-half, -half, margin]), np.array([half, half, params.ceiling - margin])
         drones.place(sim, ids, low + chance[:, 5:].reshape(-1, n, 3) * (high - low))
 
-    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
+    def act(self, sim: Sim, was: Snapshot, action: Float[np.ndarray, "B N A"]) -> None:
         """Thrust along the world's axes."""
         sim.control[:] = action.reshape(len(action), -1)
 

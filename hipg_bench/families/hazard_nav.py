@@ -123,7 +123,7 @@ class HazardNav:
         low, high = np.array([-half, -half, _TAKE_OFF[0]]), np.array([half, half, _TAKE_OFF[1]])
         drones.place(sim, ids, low + start * (high - low))
 
-    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
+    def act(self, sim: Sim, was: Snapshot, action: Float[np.ndarray, "B N A"]) -> None:
         """Thrust along the world's axes."""
         sim.control[:] = action.reshape(len(action), -1)
 

@@ -102,7 +102,7 @@ class MultiWalker:
         """Walkers stand nearly in the stance, the plank lies nearly in its place."""
         walker_body.place(self.body, sim, ids, chance, self._seats)
 
-    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
+    def act(self, sim: Sim, was: Snapshot, action: Float[np.ndarray, "B N A"]) -> None:
         """Servo targets, around the stance."""
         sim.control[:] = action.reshape(len(action), -1)
 

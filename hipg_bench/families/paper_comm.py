@@ -116,7 +116,7 @@ class PaperComm:
         # those who stand well at the start are linked before the first step
         sim.field["connected"][ids, 0] = self._connected(self.read(sim, ids))
 
-    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
+    def act(self, sim: Sim, was: Snapshot, action: Float[np.ndarray, "B N A"]) -> None:
         """Force along the world's axes."""
         particles.act(sim, self.params, self.params.agent_radius, action)
 

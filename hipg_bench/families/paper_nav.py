@@ -114,7 +114,7 @@ class PaperNav:
         sim.field["hazardous"][ids] = rank.argsort(axis=1) < self.params.hazards
         sim.field["revealed"][ids] = self._found(self.read(sim, ids))
 
-    def act(self, sim: Sim, action: Float[np.ndarray, "B N A"]) -> None:
+    def act(self, sim: Sim, was: Snapshot, action: Float[np.ndarray, "B N A"]) -> None:
         """Force along the world's axes."""
         particles.act(sim, self.params, self.radius, action)
 
