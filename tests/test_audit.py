@@ -1,13 +1,17 @@
 """The audit's true counterfactuals, against plain loops and cases whose answer is known."""
 
+import json
 import math
 from pathlib import Path
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from hipg_bench import make
+from hipg_bench.cli import app
 from hipg_bench.errors import HipgError
 from hipg_bench.learning import audit
 from hipg_bench.learning.mappo import networks
@@ -92,3 +96,17 @@ def test_an_audit_of_a_run(tmp_path: Path) -> None:
     assert len(found.credit.learned) == found.cases
     with pytest.raises(HipgError, match="checkpoint"):
         audit.load(tmp_path / "nowhere")
+
+
+def test_the_command_prints_what_it_found_and_draws_it(tmp_path: Path) -> None:
+    train(recommended("hazard_nav-4", **SMALL), tmp_path, command="test")
+    size = ["--worlds", "4", "--moments", "2", "--repeats", "2"]
+    done = CliRunner().invoke(
+        app, ["audit", "--run", str(tmp_path), *size, "--plot", str(tmp_path / "a.png")]
+    )
+    assert done.exit_code == 0, done.output
+    assert "credit" in done.stdout
+    assert imageio.imread(tmp_path / "a.png").std() > 0
+    facts = json.loads(CliRunner().invoke(app, ["audit", "--run", str(tmp_path), *size, "--json"]).stdout)
+    found = audit.audit(*audit.load(tmp_path), worlds=4, moments=2, repeats=2)
+    assert facts["credit"]["bias"] == pytest.approx(found.credit.bias, abs=1e-6)

@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from hipg_bench.cli import agents, bench, calibrate, doctor, evaluate, media, tasks, train
+from hipg_bench.cli import agents, audit, bench, calibrate, doctor, evaluate, media, tasks, train
 from hipg_bench.errors import HipgError
 
 app = typer.Typer(
@@ -26,6 +26,7 @@ app.command()(media.view)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
 app.command()(calibrate.calibrate)
+app.command()(audit.audit)
 app.command()(bench.bench)
 app.command()(doctor.doctor)
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import HipgError
@@ -25,6 +26,7 @@ from hipg_bench.learning.credit import with_each_dead
 from hipg_bench.learning.mappo import networks
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
+from hipg_bench.paths import replacing
 from hipg_bench.registry import family_of, make, task_spec
 from hipg_bench.spec import parse
 
@@ -134,6 +136,28 @@ def audit(
         cases=len(case),
         repeats=repeats,
     )
+
+
+def draw(found: Audit, path: Path, *, title: str) -> None:
+    """Write a calibration plot: what the critic says against what is true, on the line where it is right."""
+    panels = (
+        ("value of the state", found.value),
+        ("value had agent i died", found.counterfactual),
+        ("worth of agent i's life", found.credit),
+    )
+    figure = Figure(figsize=(12, 4.9), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left")
+    for axes, (name, one) in zip(figure.subplots(1, 3), panels, strict=True):
+        ends = [min(one.true.min(), one.learned.min()), max(one.true.max(), one.learned.max())]
+        axes.plot(ends, ends, color="0.6", linewidth=1)
+        axes.scatter(one.true, one.learned, s=9, alpha=0.5, linewidths=0, color="#2563a8")
+        axes.set_title(f"{name}\nbias {one.bias:+.2f}, correlation {one.correlation:.2f}", fontsize=10)
+        axes.set_xlabel("true: mean return of forked worlds")
+        axes.set_box_aspect(1)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("learned: what the critic says")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
 
 
 def load(run: Path) -> tuple[Actor, Critic, Settings]:

@@ -1,0 +1,88 @@
+"""``hipg-bench audit``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hipg_bench.cli import console
+
+if TYPE_CHECKING:
+    from hipg_bench.learning.audit import Audit, Comparison
+
+
+def audit(
+    run: Annotated[Path, typer.Option(help="Folder of a training run.")],
+    worlds: Annotated[int, typer.Option(min=1, help="Episodes that states are taken from.")] = 32,
+    moments: Annotated[int, typer.Option(min=1, help="States per episode.")] = 4,
+    repeats: Annotated[int, typer.Option(min=2, help="Rollouts per state and dead agent.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of the episodes and of all luck.")] = 500,
+    threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
+    plot: Annotated[Path | None, typer.Option(help="Calibration plot to write, a PNG.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+) -> None:
+    """Compare a critic's counterfactuals with worlds in which the agent really is dead."""
+    import torch
+
+    from hipg_bench.learning import audit as audits
+
+    torch.set_num_threads(threads)
+    actor, critic, settings = audits.load(run)
+    found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=seed)
+    if plot is not None:
+        audits.draw(found, plot, title=f"{settings.task}, {settings.arm}, seed {settings.seed}")
+    if as_json:
+        console.show_json(_facts(found) | {"run": str(run), "settings": settings.model_dump()})
+        return
+    _print(found, f"{settings.task}, arm {settings.arm}, training seed {settings.seed}")
+
+
+def _print(found: Audit, title: str) -> None:
+    rows = console.table(
+        "learned",
+        ">mean",
+        ">true mean",
+        ">bias",
+        ">error",
+        ">correlation",
+        ">noise of truth",
+        "",
+        title=title,
+    )
+    for name, about in (
+        ("value", "V(s)"),
+        ("counterfactual", "V(s with only h_i := 0)"),
+        ("credit", "the difference: what agent i's life is worth"),
+    ):
+        one: Comparison = getattr(found, name)
+        numbers = (one.learned.mean(), one.true.mean(), one.bias, one.error, one.correlation, one.noise)
+        rows.add_row(name, *(console.number(float(value), 3) for value in numbers), about)
+    console.show(rows)
+    shares = ", ".join(f"{k} dead {share:.1%}" for k, share in enumerate(found.dead_share) if share >= 0.0005)
+    console.say(
+        f"{found.cases} pairs of a state and an agent, {found.repeats} rollouts each; "
+        f"visited states: {shares}"
+    )
+
+
+def _facts(found: Audit) -> dict[str, object]:
+    compared = {
+        name: {
+            "learned_mean": float(one.learned.mean()),
+            "true_mean": float(one.true.mean()),
+            "bias": one.bias,
+            "error": one.error,
+            "correlation": one.correlation,
+            "noise": one.noise,
+        }
+        for name in ("value", "counterfactual", "credit")
+        for one in (getattr(found, name),)
+    }
+    return {
+        **compared,
+        "dead_share": found.dead_share.tolist(),
+        "cases": found.cases,
+        "repeats": found.repeats,
+    }
