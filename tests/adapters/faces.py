@@ -79,6 +79,10 @@ DRIVERS: Mapping[str, tuple[str, str]] = {
     "gymnasium-next-step": ("gymnasium", "drive_gymnasium:NextStep"),
     "gymnasium-disabled": ("gymnasium", "drive_gymnasium:Disabled"),
     "sb3": ("stable_baselines3", "drive_sb3:Slots"),
+    "dm_env": ("dm_env", "drive_dm_env:Lists"),
+    "dm_env-joint": ("dm_env", "drive_dm_env:Joint"),
+    "torchrl": ("torchrl", "drive_torchrl:Group"),
+    "rllib": ("ray", "drive_rllib:Leaving"),
 }
 """Face to the library it needs and its driver."""
 

@@ -1,0 +1,44 @@
+"""A world as dm_control's own `Physics`, for its viewer and its pixel wrapper.
+
+Bodies are dressed as in films, so that a camera tells the living from the dead. What films draw on top
+(trails, hazards) is left out: a hidden hazard must stay hidden from agents that see pixels.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from dm_control.mujoco import Physics, wrapper
+from jaxtyping import Float
+
+from hipg_bench.rendering.motion import Footage
+from hipg_bench.rendering.scene import Stage
+from hipg_bench.spec import TaskSpec
+
+
+class Mirror:
+    """Shows one world's rows; the world itself is elsewhere, forces applied to the mirror do not move it."""
+
+    def __init__(self, spec: TaskSpec, row: Float[np.ndarray, "R"]) -> None:
+        """Compile the world with everything a camera sees.
+
+        Raises:
+            RenderError: nobody has said how the family looks.
+        """
+        self._stage = Stage(Footage(spec, row[None]))
+        self._physics = Physics(wrapper.MjData(self._stage.footage.data))
+        self._show()
+
+    def physics(self, row: Float[np.ndarray, "R"]) -> Physics:
+        """The physics, put at ``row``: always the same object, all derived quantities computed."""
+        footage = self._stage.footage
+        if not np.array_equal(row, footage.rows[-1]):
+            footage.append(row)
+            self._show()
+        return self._physics
+
+    def _show(self) -> None:
+        footage = self._stage.footage
+        self._stage.dress(float(footage.time[-1]))
+        # films lean drones into their thrust; here every number is the world's own
+        mujoco.mj_forward(footage.model, footage.data)
