@@ -58,6 +58,11 @@ class Layout:
             block.name: slice(end - block.size, end) for block, end in zip(self.blocks, ends, strict=True)
         }
 
+    @functools.cached_property
+    def record(self) -> np.dtype[np.void]:
+        """One flat vector as a record: its blocks by name."""
+        return np.dtype([(block.name, np.float32, block.shape) for block in self.blocks])
+
     def pack(self, parts: Mapping[str, np.ndarray], lead: tuple[int, ...]) -> Float[np.ndarray, "*lead size"]:
         """Write named arrays into a new float32 array.
 
@@ -70,12 +75,10 @@ class Layout:
         """
         if parts.keys() != self.slices.keys():
             raise ValueError(f"parts {sorted(parts)} do not match the blocks {sorted(self.slices)}")
-        out = np.empty((*lead, self.size), np.float32)
-        for block in self.blocks:
-            target = out[..., self.slices[block.name]]
-            # splitting the last axis keeps a view, so the assignment writes through
-            target.reshape(*lead, *block.shape, copy=False)[...] = parts[block.name]
-        return out
+        record = np.empty(lead, self.record)
+        for name, part in parts.items():
+            record[name] = part
+        return record[..., None].view(np.float32)
 
     def view(self, flat: np.ndarray, name: str) -> np.ndarray:
         """Return one block of ``flat`` (..., size) with its own axes, as a view where NumPy can."""
