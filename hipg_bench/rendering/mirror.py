@@ -15,9 +15,13 @@ from hipg_bench.rendering.motion import Footage
 from hipg_bench.rendering.scene import Stage
 from hipg_bench.spec import TaskSpec
 
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_BURNT = 1.0
+"""Seconds after which films show a wreck as burnt out; here it is so at once."""
+
 
 class Mirror:
-    """Shows one world's rows; the world itself is elsewhere, forces applied to the mirror do not move it."""
+    """Shows one world's rows; the world itself is elsewhere, what is done to the mirror does not move it."""
 
     def __init__(self, spec: TaskSpec, row: Float[np.ndarray, "R"]) -> None:
         """Compile the world with everything a camera sees.
@@ -31,14 +35,14 @@ class Mirror:
 
     def physics(self, row: Float[np.ndarray, "R"]) -> Physics:
         """The physics, put at ``row``: always the same object, all derived quantities computed."""
-        footage = self._stage.footage
-        if not np.array_equal(row, footage.rows[-1]):
-            footage.append(row)
+        if not np.array_equal(row, self._stage.footage.rows[0]):
+            self._stage.footage.load(row[None])
             self._show()
         return self._physics
 
     def _show(self) -> None:
         footage = self._stage.footage
-        self._stage.dress(float(footage.time[-1]))
-        # films lean drones into their thrust; here every number is the world's own
+        self._stage.dress(float(footage.time[0]) + _BURNT)
+        # films interpolate, and lean drones into their thrust; here every number is the world's own
+        mujoco.mj_setState(footage.model, footage.data, footage.rows[0], _STATE)
         mujoco.mj_forward(footage.model, footage.data)
