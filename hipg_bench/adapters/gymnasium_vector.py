@@ -95,7 +95,7 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._ended = np.flatnonzero(done)
         told = _masked(info, np.ones(self.num_envs, bool))
         if self._mode is AutoresetMode.SAME_STEP and done.any():
-            told |= self._last(step, done)
+            told |= self._last(step, info, done)
         return self._flat(step.observation), step.reward, step.terminated, step.truncated, told
 
     def close_extras(self, **_: Any) -> None:
@@ -115,13 +115,14 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         step.reward[ids], step.terminated[ids], step.truncated[ids] = 0.0, False, False
         return step
 
-    def _last(self, step: Step, done: Bool[np.ndarray, "B"]) -> dict[str, Any]:
-        """What the episodes that just ended showed last, as Gymnasium's own vector environments tell it."""
+    def _last(self, step: Step, info: dict[str, Any], done: Bool[np.ndarray, "B"]) -> dict[str, Any]:
+        """What Gymnasium's own vector environments tell when episodes end: their last, then their next."""
         final = self._flat(step.info["final_observation"])
         seen = np.full(self.num_envs, None, object)
         seen[done] = np.fromiter(final[done], object, int(done.sum()))
-        info = {**joint_info(step), "state": step.info["final_state"], "alive": step.info["final_alive"]}
-        return _masked({"final_obs": seen, "final_info": _masked(info, done)}, done)
+        last = {**info, "state": step.info["final_state"], "alive": step.info["final_alive"]}
+        begun = {name: np.where(done, 0.0, term) for name, term in info.items() if term.ndim == 1}
+        return begun | _masked({"final_obs": seen, "final_info": _masked(last, done)}, done)
 
     def _flat(self, observation: Float[np.ndarray, "B N O"]) -> Float[np.ndarray, "B NO"]:
         return observation.reshape(self.num_envs, -1)

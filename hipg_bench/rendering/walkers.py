@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
 from hipg_bench.rendering import palette
@@ -31,6 +29,7 @@ class Carrying:
         self._cast = cast
         self.reach = 0.6 * footage.num_agents + 3.0
         self._plank = footage.body("plank/plank")
+        self._rows = self._smooth = np.empty((0, 3))
 
     def dress(self, time: float) -> None:
         """Walkers need no more than their hues."""
@@ -68,10 +67,14 @@ class Carrying:
         """Where the plank was in the first row, m."""
         return self._footage.body_position[0, self._plank]
 
-    @functools.cached_property
+    @property
     def _way(self) -> np.ndarray:
-        """The plank's way (K, 3) without its jitter; for films only, whose footage does not change."""
-        return follow(self._footage.time, self._footage.body_position[:, self._plank], _SMOOTHING)
+        """The plank's way (K, 3) without its jitter, made anew when the footage has changed."""
+        footage = self._footage
+        if self._rows is not footage.rows:
+            self._smooth = follow(footage.time, footage.body_position[:, self._plank], _SMOOTHING)
+            self._rows = footage.rows
+        return self._smooth
 
     def _draw_mark(self, brush: Brush, mark: int) -> None:
         x, strong = float(self._start[0]) + mark, mark % 5 == 0
