@@ -54,8 +54,6 @@ def test_help_is_quick_because_it_imports_nothing_heavy():
         (("tasks", "show", "multwalker-3"), "did you mean 'multiwalker-3'?"),
         (("agents", "show", "scriptd"), "did you mean 'scripted'?"),
         (("calibrate", "hazard_nav4"), "did you mean 'hazard_nav-4'?"),
-        (("bench", "--tasks", "hazard_nav4"), "did you mean 'hazard_nav-4'?"),
-        (("bench", "--tasks", TASK, "--num-envs", "1,x"), "whole numbers"),
         (("evaluate", "--episodes", "0"), "--episodes"),
         (("evaluate", "--agent", "scripted", "--tasks", "multiwalker-3"), "plays none of these tasks"),
     ],
@@ -232,8 +230,3 @@ def test_lists():
         assert task in text
         assert spec.summary in text
     assert run("agents", "show", "random").returncode == 0
-
-
-def test_bench_prints_json():
-    done = run("bench", "--tasks", TASK, "--num-envs", "1,4", "--threads", "1", "--seconds", "0.1", "--json")
-    assert [(rate["num_envs"], rate["threads"]) for rate in json.loads(done.stdout)] == [(1, 1), (4, 1)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from hipg_bench import make, task_spec
 from hipg_bench.errors import BundleError, HipgError, ResumeError
-from hipg_bench.evaluation import bench, calibration, films, report, runner
+from hipg_bench.evaluation import calibration, films, report, runner
 from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.evaluation.results import aggregate, summarise
 from hipg_bench.paths import data_folder
@@ -356,12 +356,3 @@ def test_writing_a_calibration_keeps_the_rest_of_the_file(tmp_path):
     assert tomllib.loads(calibration._without(path.read_text(), ("anchors", "calibration"))) == {
         "params": {"x": 1}
     }
-
-
-def test_bench_counts_env_steps():
-    rate = bench.measure(task_spec(TASK), 8, threads=1, seconds=0.2)
-    assert (rate.task, rate.num_envs, rate.threads) == (TASK, 8, 1)
-    assert rate.env > 100
-    # eight worlds of four drones: Python takes most of a step, so the physics alone is several times faster
-    assert 0 < rate.share < 0.8
-    assert rate.raw > rate.env
