@@ -81,9 +81,7 @@ class HipgEnv(EnvBase):
         env, moving = self._env, self._named(tensordict, "_step")
         over = self._ends.any(axis=0) & moving
         if over.any():
-            raise HipgError(
-                f"{self.spec.task}: env {over.argmax()} is waiting for reset(), its episode is over"
-            )
+            raise HipgError(f"{self.spec.task}: env {over.argmax()} is over or new: it waits for reset()")
         # who is to stand still takes part in the step, and is then put back
         still = np.flatnonzero(~moving)
         rows = env.rows[still] if len(still) else None
