@@ -1,4 +1,4 @@
-"""Particles in a plane: body, physics, contacts, deaths and senses that the paper's tasks share.
+"""Particles in a plane: body, physics, contacts and deaths that the paper's tasks share.
 
 The numbers and laws are those of the authors' code, see ``docs/paper_suite.md``. One control step is
 one physics step: v <- (1 - damping) v + F dt, then x <- x + v dt. MuJoCo's Euler integrator, which
@@ -8,19 +8,22 @@ and every force is multiplied by that same factor: v' = (v + dt factor F) / (1 +
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
 import pydantic
-from jaxtyping import Bool, Complex, Float, Int, Shaped
+from jaxtyping import Bool, Float, Float32, Int
 
 from hipg_bench.families.family import Harm, Rows
-from hipg_bench.families.scene import asset, attach
+from hipg_bench.families.scene import add_marker, asset, attach
 from hipg_bench.layout import Block, Layout
-from hipg_bench.mechanics import hazards, histogram
+from hipg_bench.mechanics import hazards, pairs
 from hipg_bench.mechanics import health as health_law
-from hipg_bench.mechanics.pairs import Gaps, between_agents, few, members, of_both, repulsion
+from hipg_bench.mechanics.pairs import Contacts, Gaps
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params, TaskSpec
 
@@ -31,11 +34,6 @@ DEATH_METRICS = tuple(f"deaths_{cause}" for cause in CAUSES)
 
 HEIGHT = 0.03
 """Of points above the floor, so that a camera sees them; the rules know no height, m."""
-
-LISTED = 5
-"""Dead agents that the histogram observation lists."""
-CELLS = (histogram.RINGS, histogram.SECTORS)
-IN_RANGE = f"within {histogram.EDGES[-1]:g} m"
 
 
 class ParticleParams(Params):
@@ -62,26 +60,6 @@ class ParticleParams(Params):
     observation: Literal["direct", "histogram"]
 
 
-@runtime_checkable
-class Body(Protocol):
-    """What the snapshots of both families hold."""
-
-    @property
-    def position(self) -> Float[np.ndarray, "B N 2"]:
-        """In m."""
-        ...
-
-    @property
-    def velocity(self) -> Float[np.ndarray, "B N 2"]:
-        """In m/s."""
-        ...
-
-    @property
-    def health(self) -> Float[np.ndarray, "B N"]:
-        """1 or 0."""
-        ...
-
-
 class Past(NamedTuple):
     """What the previous control step left behind, from which its histogram is counted again."""
 
@@ -92,8 +70,206 @@ class Past(NamedTuple):
     """False in an episode's first observation."""
 
 
-def scene(spec: TaskSpec, params: ParticleParams, radius: float) -> mujoco.MjSpec:
-    """A floor with N particles; particle i's joints, looks and motors are prefixed ``drone<i>/``."""
+@dataclasses.dataclass(kw_only=True)
+class Snapshot:
+    """The world at the end of a control step, as far as both families have the same."""
+
+    position: Float[np.ndarray, "B N 2"]  # m
+    velocity: Float[np.ndarray, "B N 2"]  # m/s; of the dead, the one they died with
+    health: Float[np.ndarray, "B N"]
+    point: Float[np.ndarray, "B L 2"]  # landmarks, or terminals and the hazard, m
+    gaps: Gaps  # agents to agents, and to points
+    contacts: Contacts  # agents that push each other, if they live
+    exposed: tuple[Int[np.ndarray, "M"], ...]  # world, agent, point: the M cases of an agent in a hazard
+    past: Past | None  # with the histogram observation
+    look: Float32[np.ndarray, "B N K"] | None = None  # this step's part of the histogram observation
+    past_look: Float32[np.ndarray, "B N K"] | None = None  # the previous step's; both counted once only
+
+
+S = TypeVar("S", bound=Snapshot)
+
+
+class Particles(abc.ABC, Generic[S]):
+    """Rules that both families share; see `hipg_bench.families.family.Family` for each public method.
+
+    Attributes:
+        radius: of an agent, m.
+    """
+
+    causes: tuple[str, ...] = CAUSES
+    physics_steps: int = 1
+
+    def __init__(self, spec: TaskSpec, params: ParticleParams, radius: float) -> None:
+        self.spec = spec
+        self.radius = radius
+        self._law = params
+        self._direct = params.observation == "direct"
+        self._factor = _factor(params)
+        n = spec.num_agents
+        self._memory = {"velocity": 2 * n}
+        if not self._direct:
+            self._memory |= {"past_position": 2 * n, "past_velocity": 2 * n, "past_health": n}
+
+    def act(self, sim: Sim, was: S, action: Float[np.ndarray, "B N 2"]) -> None:
+        """Push the living, by own force and by contact; the dead stand still at once and touch nobody."""
+        alive, law = was.health > 0, self._law
+        if not alive.all():
+            np.copyto(sim.velocity, 0.0, where=np.repeat(~alive, 2, axis=1))
+        sim.control[:] = action.reshape(len(action), -1)
+        push = pairs.repulsion(
+            was.contacts, alive, 2 * self.radius, law.contact_stiffness, law.contact_margin
+        )
+        sim.applied[:] = self._factor * push.reshape(len(action), -1)
+
+    def harm(self, was: S, now: S) -> Harm:
+        """Exposure from hazards, and from every contact of the living."""
+        alive = was.health > 0
+        burn, crash = self._burn(now), self._crash(now, alive)
+        return Harm(burn + crash, np.zeros_like(alive), cause=np.where(crash > burn, _COLLISION, _HAZARD))
+
+    def terminated(self, now: S) -> tuple[Bool[np.ndarray, "B"], str]:
+        """Never: the dead stay, and so does the horizon."""
+        return np.zeros(len(now.health), bool), ""
+
+    def observe(self, now: S) -> Float[np.ndarray, "n N O"]:
+        """Points and other agents, listed or counted."""
+        if self._direct:
+            return self._list(now)
+        return np.concatenate([self._look(now), self._look_back(now)], axis=-1)
+
+    @abc.abstractmethod
+    def _list(self, now: S) -> Float[np.ndarray, "n N O"]:
+        """The direct observation."""
+
+    @abc.abstractmethod
+    def _count(self, now: S) -> Float[np.ndarray, "n N K"]:
+        """One control step's part of the histogram observation."""
+
+    def _before(self, now: S, past: Past) -> S:
+        """The previous control step, as far as its part of the histogram observation needs it."""
+        return dataclasses.replace(
+            now,
+            position=past.position,
+            velocity=past.velocity,
+            health=past.health,
+            gaps=pairs.gaps(past.position, now.point),
+        )
+
+    def _look(self, now: S) -> Float[np.ndarray, "n N K"]:
+        """This step's part of the histogram observation."""
+        if now.look is None:
+            now.look = self._count(now)
+        return now.look
+
+    def _look_back(self, now: S) -> Float[np.ndarray, "n N K"]:
+        """The previous step's part; where nobody kept it, from what the rows remember; zeros at first."""
+        if now.past_look is None:
+            past = now.past
+            if past is None:
+                raise ValueError("a direct observation does not look back")
+            now.past_look = np.zeros_like(self._look(now))
+            if past.exists.any():
+                seen = self._count(self._before(now, past))
+                now.past_look[past.exists] = seen[past.exists]
+        return now.past_look
+
+    def _bodies(self, sim: Sim, rows: Rows, hazardous: Bool[np.ndarray, "n L"]) -> dict[str, Any]:
+        """What all snapshots hold. Positions do not lag behind the physics: they are generalised coordinates.
+
+        Args:
+            sim: whose worlds are read.
+            rows: which.
+            hazardous: points that harm.
+        """
+        field, n = sim.field, self.spec.num_agents
+        health = field["health"][rows].copy()
+        position = sim.position[rows].reshape(-1, n, 2).copy()
+        velocity = sim.velocity[rows].copy()
+        if not health.all():
+            # the dead are seen with the velocity they died with
+            np.copyto(velocity, field["velocity"][rows], where=np.repeat(health == 0, 2, axis=1))
+        point = sim.marker[rows][..., :2].copy()
+        gaps = pairs.gaps(position, point)
+        where, agent, world = pairs.few(gaps.away < self._law.hazard_radius)
+        harmful = hazardous[world, where]
+        return {
+            "health": health,
+            "position": position,
+            "velocity": velocity.reshape(-1, n, 2),
+            "point": point,
+            "gaps": gaps,
+            "contacts": pairs.contacts(gaps, 2 * self.radius, self._law.contact_margin),
+            "exposed": (world[harmful], agent[harmful], where[harmful]),
+            "past": None if self._direct else self._past(sim, rows),
+        }
+
+    def _past(self, sim: Sim, rows: Rows) -> Past:
+        """The previous control step, as the rows remember it."""
+        field, n = sim.field, self.spec.num_agents
+        return Past(
+            position=field["past_position"][rows].reshape(-1, n, 2).copy(),
+            velocity=field["past_velocity"][rows].reshape(-1, n, 2).copy(),
+            health=field["past_health"][rows].copy(),
+            exists=field["elapsed"][rows, 0] > 0,
+        )
+
+    def _keep(self, sim: Sim, was: S, now: S) -> None:
+        """Write what outlives the step: the velocity that the dead keep, and the step if it is seen again."""
+        field, worlds = sim.field, len(now.health)
+        field["velocity"][:] = now.velocity.reshape(worlds, -1)
+        if not self._direct:
+            field["past_position"][:] = was.position.reshape(worlds, -1)
+            field["past_velocity"][:] = was.velocity.reshape(worlds, -1)
+            field["past_health"][:] = was.health
+            now.past_look = self._look(was)
+
+    def _burn(self, now: S) -> Float[np.ndarray, "B N"]:
+        """Exposure of each agent from the hazards it is in, nats."""
+        world, agent, point = now.exposed
+        if not len(world):
+            return np.zeros_like(now.health)
+        law = self._law
+        risk = hazards.risk(now.gaps.away[point, agent, world], law.hazard_radius, law.hazard_peak)
+        rate = health_law.hazard_rate(risk, self.spec.control_step / 0.1)
+        whom = world * self.spec.num_agents + agent
+        return np.bincount(whom, rate, now.health.size).reshape(now.health.shape)
+
+    def _crash(self, now: S, alive: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
+        """Exposure of each agent from its contacts, nats."""
+        both, _ = self._overlaps(now, alive)
+        whom = np.concatenate([now.contacts.one[both], now.contacts.other[both]])
+        if not (self._law.collision_risk and len(whom)):
+            return np.zeros_like(now.health)
+        rate = np.full(len(whom), -np.log1p(-self._law.collision_risk))
+        return np.bincount(whom, rate, alive.size).reshape(alive.shape)
+
+    def _overlaps(
+        self, now: S, alive: Bool[np.ndarray, "B N"]
+    ) -> tuple[Bool[np.ndarray, "M"], Bool[np.ndarray, "M"]]:
+        """Of all contacts, the overlaps of which both live, and those of which one does."""
+        touch, flags = now.contacts.distance < 2 * self.radius, alive.ravel()
+        one, other = flags[now.contacts.one], flags[now.contacts.other]
+        return touch & one & other, touch & (one ^ other)
+
+    def _per_world(self, now: S, which: Bool[np.ndarray, "M"]) -> Float[np.ndarray, "B"]:
+        """How many of the contacts there are in each world."""
+        return np.bincount(now.contacts.world[which], minlength=len(now.health)).astype(np.float64)
+
+
+def deaths_by_cause(sim: Sim, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "n"]]:
+    """``deaths_<cause>``: how many agents each cause killed."""
+    dead, cause = sim.field["health"][ids] == 0, sim.field["death_cause"][ids]
+    return {
+        name: (dead & (cause == k)).sum(axis=1).astype(np.float64) for k, name in enumerate(DEATH_METRICS)
+    }
+
+
+def scene(spec: TaskSpec, params: ParticleParams, radius: float, points: Mapping[str, str]) -> mujoco.MjSpec:
+    """A floor with N particles of some radius, m, and points by name and kind of looks.
+
+    Particle i's joints, looks and motors are prefixed ``drone<i>/``; points are mocap bodies, so that they
+    are part of the row.
+    """
     world = asset("arena.xml")
     world.option.timestep = spec.control_step
     world.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -110,209 +286,14 @@ def scene(spec: TaskSpec, params: ParticleParams, radius: float) -> mujoco.MjSpe
             motor.gear[0] = factor
         particle.geom("foot").size[0] = radius
         attach(world, particle, f"drone{i}/")
+    for name, kind in points.items():
+        add_marker(world, name, kind).pos[2] = HEIGHT
     return world
-
-
-def memory(params: ParticleParams, num_agents: int) -> dict[str, int]:
-    """Fields of an episode that particles need: the last velocity, and the step before where it is seen."""
-    velocity = {"velocity": 2 * num_agents}
-    if params.observation == "direct":
-        return velocity
-    return {
-        **velocity,
-        "past_position": 2 * num_agents,
-        "past_velocity": 2 * num_agents,
-        "past_health": num_agents,
-    }
 
 
 def place(sim: Sim, ids: Int[np.ndarray, "n"], chance: Float[np.ndarray, "n C"], half_width: float) -> None:
     """Put agents at rest, independently and uniformly; they may overlap."""
     sim.position[ids] = half_width * (2 * chance - 1)
-
-
-def act(sim: Sim, params: ParticleParams, radius: float, action: Float[np.ndarray, "B N 2"]) -> None:
-    """Push the living, by their own force and by contact; the dead stand still at once and touch nobody."""
-    alive = sim.field["health"] > 0
-    np.copyto(sim.velocity, 0.0, where=np.repeat(~alive, 2, axis=1))
-    sim.control[:] = action.reshape(len(action), -1)
-    apart = between_agents(sim.position.reshape(action.shape))
-    push = repulsion(apart, alive, 2 * radius, params.contact_stiffness, params.contact_margin)
-    sim.applied[:] = _factor(params) * push.reshape(len(action), -1)
-
-
-def kinematics(
-    sim: Sim, num_agents: int, rows: Rows
-) -> tuple[Float[np.ndarray, "n N 2"], Float[np.ndarray, "n N 2"]]:
-    """Positions (m) and velocities (m/s); that of a dead agent is the one it died with."""
-    alive = np.repeat(sim.field["health"][rows] > 0, 2, axis=1)
-    velocity = np.where(alive, sim.velocity[rows], sim.field["velocity"][rows])
-    position = sim.position[rows].copy()
-    return position.reshape(-1, num_agents, 2), velocity.reshape(-1, num_agents, 2)
-
-
-def past(sim: Sim, num_agents: int, rows: Rows) -> Past:
-    """The previous control step, as the rows remember it."""
-    field = sim.field
-    return Past(
-        position=field["past_position"][rows].reshape(-1, num_agents, 2).copy(),
-        velocity=field["past_velocity"][rows].reshape(-1, num_agents, 2).copy(),
-        health=field["past_health"][rows].copy(),
-        exists=field["elapsed"][rows, 0] > 0,
-    )
-
-
-def remember(sim: Sim, was: Body, now: Body, *, past: bool) -> None:
-    """Write what outlives the step: the velocity that the dead keep, and the step before if it is seen."""
-    field = sim.field
-    field["velocity"][:] = now.velocity.reshape(len(now.velocity), -1)
-    if past:
-        field["past_position"][:] = was.position.reshape(len(was.position), -1)
-        field["past_velocity"][:] = was.velocity.reshape(len(was.velocity), -1)
-        field["past_health"][:] = was.health
-
-
-def touching(apart: Gaps, radius: float) -> Bool[np.ndarray, "P B"]:
-    """Pairs that overlap, dead or alive."""
-    return apart.distance < 2 * radius
-
-
-def harm(
-    params: ParticleParams,
-    burn: Float[np.ndarray, "B N"],
-    touch: Bool[np.ndarray, "P B"],
-    alive: Bool[np.ndarray, "B N"],
-) -> Harm:
-    """Exposure from hazards, and from every contact with another live agent.
-
-    Args:
-        params: the family's numbers.
-        burn: exposure from hazards, nats.
-        touch: pairs that overlap.
-        alive: before this step.
-    """
-    which, world = few(touch)
-    one, other = (agents[which] for agents in members(alive.shape[1]))
-    crash = np.zeros_like(burn)
-    risk = np.where(alive[world, one] & alive[world, other], -np.log1p(-params.collision_risk), 0.0)
-    np.add.at(crash, (world, one), risk)
-    np.add.at(crash, (world, other), risk)
-    cause = np.where(crash > burn, _COLLISION, _HAZARD)
-    return Harm(burn + crash, fatal=np.zeros_like(alive), cause=cause)
-
-
-def burn(
-    params: ParticleParams,
-    distance: Float[np.ndarray, "L N B"],
-    hazardous: Bool[np.ndarray, "B L"],
-    control_step: float,
-) -> Float[np.ndarray, "B N"]:
-    """Exposure of each agent from the points that are hazardous, nats."""
-    exposure = np.zeros((distance.shape[2], distance.shape[1]))
-    # few agents are near a point: the law is worked out only for them
-    point, agent, world = few(distance < params.hazard_radius)
-    risk = hazards.risk(distance[point, agent, world], params.hazard_radius, params.hazard_peak)
-    risk = np.where(hazardous[world, point], risk, 0.0)
-    np.add.at(exposure, (world, agent), health_law.hazard_rate(risk, control_step / 0.1))
-    return exposure
-
-
-def deaths_by_cause(sim: Sim, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "n"]]:
-    """``deaths_<cause>``: how many agents each cause killed."""
-    dead, cause = sim.field["health"][ids] == 0, sim.field["death_cause"][ids]
-    return {
-        name: (dead & (cause == k)).sum(axis=1).astype(np.float64) for k, name in enumerate(DEATH_METRICS)
-    }
-
-
-def agents_around(apart: Gaps, alive: Bool[np.ndarray, "B N"]) -> Int[np.ndarray, "B N 4 8"]:
-    """Histogram of the other live agents around each agent."""
-    first, second = members(alive.shape[1])
-    one, other = of_both(alive)
-    cell = histogram.cells(apart.gap, apart.distance)
-    return histogram.tally(
-        np.concatenate([cell, histogram.opposite(cell)]),
-        np.concatenate([other, one]),
-        np.concatenate([first, second]),
-        alive.shape[1],
-    )
-
-
-def points_around(away: Gaps, counted: Bool[np.ndarray, "L B"]) -> Int[np.ndarray, "B N 4 8"]:
-    """Histogram of the points that count around each agent."""
-    points, agents, worlds = away.distance.shape
-    cell = histogram.cells(away.gap, away.distance).reshape(-1, worlds)
-    observer = np.tile(np.arange(agents), points)
-    return histogram.tally(cell, np.repeat(counted, agents, axis=0), observer, agents)
-
-
-def nearest_dead(
-    position: Float[np.ndarray, "B N 2"], dead: Bool[np.ndarray, "B N"]
-) -> Float[np.ndarray, "B N 5 2"]:
-    """Where the nearest other dead agents lie relative to each agent, m, at any distance; zeros beyond."""
-    found = np.zeros((*dead.shape, LISTED, 2))
-    ids = np.flatnonzero(dead.any(axis=1))
-    if not len(ids):
-        return found
-    # only as many columns as the worst world has dead
-    place, dead = _complex(position[ids]), dead[ids]
-    which = np.argsort(~dead, axis=1, stable=True)[:, : dead.sum(axis=1).max()]
-    gap = np.take_along_axis(place, which, axis=1)[:, None] - place[:, :, None]
-    agents = np.arange(dead.shape[1])[:, None]
-    counts = np.take_along_axis(dead, which, axis=1)[:, None] & (which[:, None] != agents)
-    squared = np.where(counts, np.real(gap) ** 2 + np.imag(gap) ** 2, np.inf)
-    order = np.argsort(squared, axis=-1, stable=True)[..., :LISTED]
-    nearest = np.take_along_axis(np.where(counts, gap, 0.0), order, axis=-1)
-    found[ids, :, : order.shape[-1]] = nearest.view(np.float64).reshape(*nearest.shape, 2)
-    return found
-
-
-def own_blocks() -> tuple[Block, ...]:
-    """What every observation begins with."""
-    return (
-        Block("terminated", (1,), "1", "-", "1 once dead"),
-        Block("velocity", (2,), "m/s", "world"),
-        Block("position", (2,), "m", "world"),
-    )
-
-
-def around_blocks() -> tuple[Block, ...]:
-    """What every histogram observation ends with, per step."""
-    return (
-        Block("other_count", CELLS, "agents", "own", f"{IN_RANGE}, live agents"),
-        Block("dead_position", (LISTED, 2), "m", "own", "nearest dead agents, at any distance"),
-    )
-
-
-def two_steps(look: Layout) -> Layout:
-    """A histogram observation: this control step, then the previous one."""
-    before = tuple(
-        Block(f"previous_{b.name}", b.shape, b.unit, b.frame, f"{b.visible}; one step ago, 0 at first")
-        for b in look.blocks
-    )
-    return Layout((*look.blocks, *before))
-
-
-def others(table: Shaped[np.ndarray, "*B N N"]) -> Shaped[np.ndarray, "*B N N-1"]:
-    """Drop each agent's entry about itself."""
-    n = table.shape[-1]
-    # behind the first entry, every (N + 1)th lies on the diagonal
-    rows = table.reshape(-1, n * n)[:, 1:].reshape(-1, n - 1, n + 1)[..., :-1]
-    return rows.reshape(*table.shape[:-1], n - 1)
-
-
-def relative(
-    of: Float[np.ndarray, "B N 2"], shown: Bool[np.ndarray, "B N N-1"]
-) -> Float[np.ndarray, "B N N-1 2"]:
-    """A quantity of every other agent, in their order, less the observer's own; zeros where not shown."""
-    vector = _complex(of)
-    gap = np.where(shown, others(vector[:, None] - vector[:, :, None]), 0.0)
-    return gap.view(np.float64).reshape(*gap.shape, 2)
-
-
-def _complex(vector: Float[np.ndarray, "B N 2"]) -> Complex[np.ndarray, "B N"]:
-    """Vectors of the plane as one number each, so that axes of two do not slow NumPy down."""
-    return np.ascontiguousarray(vector).view(np.complex128)[..., 0]
 
 
 def _factor(params: ParticleParams) -> float:

@@ -2,7 +2,7 @@
 
 Arrays run along the worlds, B last, so that each operation sweeps over all worlds in one go; that is
 several times faster than with short last axes. N agents make P = N (N - 1) / 2 pairs, each of them
-once, in the order (0, 1), (0, 2), ..., (N - 2, N - 1).
+once, in the order (0, 1), (0, 2), ..., (N - 2, N - 1); L points make L N further gaps, point by point.
 """
 
 from __future__ import annotations
@@ -18,12 +18,41 @@ _FADE = 40.0
 
 
 class Gaps(NamedTuple):
-    """How things stand to each other: P pairs of agents, or L points by N agents."""
+    """How N agents stand to each other and to L points: K = P + L N gaps."""
 
-    gap: Float[np.ndarray, "2 *pairs B"]
-    """From the first agent to the second, or from the agent to the point, m."""
-    distance: Float[np.ndarray, "*pairs B"]
+    num_agents: int
+    gap: Float[np.ndarray, "2 K B"]
+    """From the first agent of a pair to the second, or from the agent to the point, m."""
+    distance: Float[np.ndarray, "K B"]
     """m."""
+
+    @property
+    def apart(self) -> Float[np.ndarray, "P B"]:
+        """Distance within each pair of agents, m."""
+        return self.distance[: count(self.num_agents)]
+
+    @property
+    def away(self) -> Float[np.ndarray, "L N B"]:
+        """Distance from each point to each agent, m."""
+        return self.distance[count(self.num_agents) :].reshape(-1, self.num_agents, self.distance.shape[1])
+
+
+class Contacts(NamedTuple):
+    """M pairs of agents that are near each other, over all worlds."""
+
+    world: Int[np.ndarray, "M"]
+    one: Int[np.ndarray, "M"]
+    other: Int[np.ndarray, "M"]
+    """Agents, counted through all worlds: N world + agent."""
+    gap: Float[np.ndarray, "2 M"]
+    """From one to the other, m."""
+    distance: Float[np.ndarray, "M"]
+    """m."""
+
+
+def count(num_agents: int) -> int:
+    """P, the number of pairs."""
+    return num_agents * (num_agents - 1) // 2
 
 
 @functools.cache
@@ -32,21 +61,27 @@ def members(num_agents: int) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]
     return np.triu_indices(num_agents, 1)
 
 
-def between_agents(position: Float[np.ndarray, "B N 2"]) -> Gaps:
-    """Gaps and distances within all pairs, (2, P, B) and (P, B)."""
-    first, second = members(position.shape[1])
-    place = np.ascontiguousarray(position.transpose(2, 1, 0))
-    gap = place[:, second]
-    gap -= place[:, first]
-    return Gaps(gap, _length(gap))
+def gaps(position: Float[np.ndarray, "B N 2"], point: Float[np.ndarray, "B L 2"]) -> Gaps:
+    """Measure all gaps, m."""
+    worlds, agents, _ = position.shape
+    first, second = members(agents)
+    here, there = (np.ascontiguousarray(place.transpose(2, 1, 0)) for place in (position, point))
+    gap = np.empty((2, len(first) + point.shape[1] * agents, worlds))
+    np.subtract(here.take(second, axis=1), here.take(first, axis=1), out=gap[:, : len(first)])
+    away = gap[:, len(first) :].reshape(2, -1, agents, worlds, copy=False)
+    np.subtract(there[:, :, None], here[:, None], out=away)
+    square = gap * gap
+    square[0] += square[1]
+    return Gaps(agents, gap, np.sqrt(square[0], out=square[0]))
 
 
-def to_points(position: Float[np.ndarray, "B N 2"], point: Float[np.ndarray, "B L 2"]) -> Gaps:
-    """Gaps and distances from every agent to every point, (2, L, N, B) and (L, N, B)."""
-    here = np.ascontiguousarray(position.transpose(2, 1, 0))
-    there = np.ascontiguousarray(point.transpose(2, 1, 0))
-    gap = there[:, :, None] - here[:, None]
-    return Gaps(gap, _length(gap))
+def contacts(all_gaps: Gaps, reach: float, margin: float) -> Contacts:
+    """Pairs of agents near enough for `repulsion` to push them apart."""
+    which, world = few(all_gaps.apart < reach + _FADE * margin)
+    first, second = members(all_gaps.num_agents)
+    own = world * all_gaps.num_agents
+    gap, distance = all_gaps.gap[:, which, world], all_gaps.distance[which, world]
+    return Contacts(world, own + first[which], own + second[which], gap, distance)
 
 
 def of_both(member: Bool[np.ndarray, "B N"]) -> tuple[Bool[np.ndarray, "P B"], Bool[np.ndarray, "P B"]]:
@@ -65,13 +100,26 @@ def table(holds: Bool[np.ndarray, "P B"], num_agents: int) -> Bool[np.ndarray, "
     return full
 
 
+def linked(
+    links: Bool[np.ndarray, "N N B"], start: Bool[np.ndarray, "N B"], goal: Bool[np.ndarray, "N B"]
+) -> Bool[np.ndarray, "B"]:
+    """Whether links lead from some agent of ``start`` to some agent of ``goal``.
+
+    The loop is over hops: it ends when no world's set of reached agents grows, after at most N rounds.
+    """
+    reached, further = start, start | (links & start[:, None]).any(axis=0)
+    while (further != reached).any():
+        reached, further = further, further | (links & further[:, None]).any(axis=0)
+    return np.logical_or.reduce(reached & goal, axis=0)
+
+
 def few(holds: Bool[np.ndarray, "*axes"]) -> tuple[Int[np.ndarray, "n"], ...]:
     """`np.nonzero`, several times faster where few entries of several axes hold."""
     return np.unravel_index(np.flatnonzero(holds), holds.shape)
 
 
 def repulsion(
-    apart: Gaps, solid: Bool[np.ndarray, "B N"], reach: float, stiffness: float, margin: float
+    contact: Contacts, solid: Bool[np.ndarray, "B N"], reach: float, stiffness: float, margin: float
 ) -> Float[np.ndarray, "B N 2"]:
     """Soft contact force on each agent: ``stiffness * margin * softplus((reach - d) / margin)``, N.
 
@@ -79,26 +127,19 @@ def repulsion(
     stand at the very same place push nowhere: they have no line of centres.
 
     Args:
-        apart: pairs of agents.
+        contact: pairs of agents that may push each other.
         solid: agents that touch others at all.
         reach: sum of two radii, m.
         stiffness: N/m deep inside the contact.
         margin: depth over which the contact sets in, m.
     """
-    first, second = members(solid.shape[1])
-    which, world = few(apart.distance < reach + _FADE * margin)
-    one, other, distance = first[which], second[which], apart.distance[which, world]
-    push = solid[world, one] & solid[world, other] & (distance > 0)
-    which, world, one, other, distance = which[push], world[push], one[push], other[push], distance[push]
+    holds = solid.ravel()
+    push = np.flatnonzero(holds[contact.one] & holds[contact.other] & (contact.distance > 0))
+    if not len(push):
+        return np.zeros((*solid.shape, 2))
+    distance = contact.distance[push]
     strength = stiffness * margin * np.logaddexp(0.0, (reach - distance) / margin)
-    away = (apart.gap[:, which, world] / distance * strength).T
-    force = np.zeros((*solid.shape, 2))
-    np.add.at(force, (world, other), away)
-    np.subtract.at(force, (world, one), away)
-    return force
-
-
-def _length(gap: Float[np.ndarray, "2 *pairs B"]) -> Float[np.ndarray, "*pairs B"]:
-    length, other = gap[0] * gap[0], gap[1] * gap[1]
-    length += other
-    return np.sqrt(length, out=length)
+    away = contact.gap[:, push] / distance * strength
+    whom = np.concatenate([contact.other[push], contact.one[push]])
+    force = [np.bincount(whom, np.concatenate([part, -part]), solid.size) for part in away]
+    return np.stack(force, axis=-1).reshape(*solid.shape, 2)
