@@ -55,10 +55,8 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._live.begin(self._env.rows[0])
         return self._look(step)
 
-    def step(
-        self, action: Float[np.ndarray, "NA"]
-    ) -> tuple[Float[np.ndarray, "NO"], float, bool, bool, dict[str, Any]]:
-        """Advance by one control step.
+    def step(self, action: Any) -> tuple[Float[np.ndarray, "NO"], float, bool, bool, dict[str, Any]]:
+        """Advance by one control step: a joint action (N * A,), in [-1, 1].
 
         Raises:
             HipgError: the episode is over or has not begun.

@@ -81,8 +81,11 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._ended = self._ended[~mask[self._ended]]
         return self._flat(step.observation), _masked(joint_info(step), np.ones(self.num_envs, bool))
 
-    def step(self, actions: Float[np.ndarray, "B NA"]) -> Returned:
-        """Advance every world by one control step; actions for worlds that begin in it are ignored.
+    def step(self, actions: Any) -> Returned:
+        """Advance every world by one control step; what worlds that begin in it are told is ignored.
+
+        Args:
+            actions: (B, N * A), in [-1, 1].
 
         Raises:
             HipgError: a world whose episode is over, without automatic reset, or has not begun.

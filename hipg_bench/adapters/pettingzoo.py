@@ -33,7 +33,7 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
     Infos hold ``alive`` and ``health``.
 
     Attributes:
-        spec: the task's numbers.
+        task_spec: the task's numbers.
         agents: who acts next; empty when the episode is over.
         state_space: of `state`.
     """
@@ -60,7 +60,7 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
         """
         EzPickle.__init__(self, task, dead, render_mode, seed, **overrides)
         self._env = env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
-        self.spec = spec = env.spec
+        self.task_spec = spec = env.spec
         if dead not in ("remove", "ghost"):
             raise SpecError(f"{spec.task}: dead = {dead!r} is refused{hint(dead, ('remove', 'ghost'))}")
         self._remove, self.render_mode = dead == "remove", render_mode
@@ -78,11 +78,11 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
 
     def observation_space(self, agent: str) -> Box:
         """An agent's own, the same object each time."""
-        return self._sees[checked_name(self.spec, agent, self._number)]
+        return self._sees[checked_name(self.task_spec, agent, self._number)]
 
     def action_space(self, agent: str) -> Box:
         """An agent's own, the same object each time."""
-        return self._does[checked_name(self.spec, agent, self._number)]
+        return self._does[checked_name(self.task_spec, agent, self._number)]
 
     def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Told, Told]:
         """Start the next episode, with a seed episode 0 of that seed; ``options`` has no effect."""
@@ -104,14 +104,16 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
         """
         was = self._seen()
         if not self.agents:
-            raise HipgError(f"{self.spec.task}: the episode is over: reset() comes before the next step()")
+            raise HipgError(
+                f"{self.task_spec.task}: the episode is over: reset() comes before the next step()"
+            )
         lived = was.info["alive"]
         step = self._now = self._env.step(gather(self._env, self._number, actions, lived[0].tolist()))
-        terminated, truncated = (bool(flag[0]) for flag in death.ends(self.spec, step))
+        terminated, truncated = (bool(flag[0]) for flag in death.ends(self.task_spec, step))
         agents, alive = self.agents, step.info["alive"][0].tolist()
         leaves = {a: terminated or (self._remove and not alive[self._number[a]]) for a in agents}
         timeout = {a: truncated and not leaves[a] for a in agents}
-        paid = death.pay(self.spec, step, lived)[0].tolist()
+        paid = death.pay(self.task_spec, step, lived)[0].tolist()
         self.agents = [a for a in agents if not (leaves[a] or timeout[a])]
         if self._live:
             self._live.see(self._env.rows[0])
@@ -140,7 +142,9 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
 
     def _seen(self) -> Step:
         if self._now is None:
-            raise HipgError(f"{self.spec.task}: reset() comes first: no episode has begun, or it is closed")
+            raise HipgError(
+                f"{self.task_spec.task}: reset() comes first: no episode has begun, or it is closed"
+            )
         return self._now
 
     def _look(self, step: Step, agents: list[str]) -> tuple[Told, Told]:

@@ -24,14 +24,14 @@ from hipg_bench.spec import TaskSpec
 
 
 class HipgVecEnv(VecEnv):
-    """B worlds of a task; ``spec`` holds its numbers. Infos tell who is ``alive``."""
+    """B worlds of a task; ``task_spec`` holds its numbers. Infos tell who is ``alive``."""
 
     def __init__(
         self, task: str | TaskSpec, num_envs: int = 1, seed: int = 0, threads: int = 0, **overrides: Any
     ) -> None:
         """Build B = ``num_envs`` worlds, otherwise as `hipg_bench.make`."""
         self._env = env = make(task, num_envs, seed, threads=threads, autoreset=False, **overrides)
-        self.spec, self.render_mode = env.spec, None
+        self.task_spec, self.render_mode = env.spec, None
         sees, does = Box(-np.inf, np.inf, (env.observation_size,)), Box(-1.0, 1.0, (env.action_size,))
         super().__init__(num_envs * env.num_agents, sees, does)
         self._lived = np.ones((num_envs, env.num_agents), bool)
@@ -44,8 +44,8 @@ class HipgVecEnv(VecEnv):
         self._lived = step.info["alive"]
         return self._by_slot(step.observation)
 
-    def step_async(self, actions: Float[np.ndarray, "slots A"]) -> None:
-        """Keep the actions for `step_wait`."""
+    def step_async(self, actions: Any) -> None:
+        """Keep the actions (B * N, A) for `step_wait`."""
         self._action = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -58,13 +58,13 @@ class HipgVecEnv(VecEnv):
         env, shape = self._env, (self.num_envs, self._env.action_size)
         if np.shape(self._action) != shape:
             raise ActionError(
-                f"{self.spec.task}: actions of shape {shape} (B * N, A) are allowed, "
+                f"{self.task_spec.task}: actions of shape {shape} (B * N, A) are allowed, "
                 f"got {np.shape(self._action)}"
             )
         step = env.step(self._action.reshape(env.num_envs, env.num_agents, env.action_size))
-        terminated, truncated = death.ends(self.spec, step)
+        terminated, truncated = death.ends(self.task_spec, step)
         done = terminated | truncated
-        reward = death.pay(self.spec, step, self._lived).astype(np.float32)
+        reward = death.pay(self.task_spec, step, self._lived).astype(np.float32)
         infos: list[dict[str, Any]] = [
             {"alive": alive, "TimeLimit.truncated": False} for alive in step.info["alive"].ravel().tolist()
         ]

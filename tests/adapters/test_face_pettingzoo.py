@@ -16,6 +16,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.utils import aec_to_parallel, parallel_to_aec
 
 import hipg_bench
+import hipg_bench.errors
 from hipg_bench.adapters.pettingzoo import HipgParallelEnv
 from hipg_bench.rendering import gl
 
@@ -144,7 +145,7 @@ def test_pettingzoo_makes_every_task_by_its_id():
     env = pettingzoo.make("parallel", "hipg/hazard_nav-4-v1", dead="ghost", horizon=7)
     assert isinstance(env, HipgParallelEnv)
     assert str(env) == "hazard_nav-4_v1"
-    assert env.spec.horizon == 7
+    assert env.task_spec.horizon == 7
 
 
 def test_pickle_and_deepcopy_start_anew():
@@ -154,7 +155,7 @@ def test_pickle_and_deepcopy_start_anew():
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
         again, _ = twin.reset()
         np.testing.assert_array_equal(again["agent_2"], first["agent_2"])
-        assert twin.spec == env.spec
+        assert twin.task_spec == env.task_spec
 
 
 @modes
@@ -203,6 +204,19 @@ def test_pictures_show_what_has_changed(task):
     # the same episode once more looks the same but for rounding, whatever was shown in between
     np.testing.assert_allclose(frames[0].astype(int), frames[2], atol=3)
     np.testing.assert_allclose(frames[1].astype(int), frames[3], atol=3)
+
+
+@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.MEND}")
+def test_a_renderer_that_dies_is_an_error_and_not_a_hang():
+    env = hipg_bench.parallel_env("coop_nav-3", render_mode="rgb_array")
+    env.reset()
+    env.render()
+    env._live._child._process.kill()
+    for _ in range(2):
+        env.step({agent: np.zeros(3) for agent in env.agents})
+        with pytest.raises(hipg_bench.errors.RenderError, match="coop_nav-3: .*ended with code -9"):
+            env.render()
+    env.close()
 
 
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="no virtual display")
