@@ -18,14 +18,14 @@ from hipg_bench.families.paper_nav import PaperNav
 from hipg_bench.paths import data_folder
 from hipg_bench.spec import TaskSpec
 
-FAMILIES: Mapping[str, Callable[[TaskSpec], Family]] = {
+FAMILIES: dict[str, Callable[[TaskSpec], Family]] = {
     "hazard_nav": HazardNav,
     "hazard_comm": HazardComm,
     "multiwalker": MultiWalker,
     "paper_nav": PaperNav,
     "paper_comm": PaperComm,
 }
-"""Name in a task file to the class with its rules."""
+"""Name in a task file to the class with its rules; one of your own is added here."""
 
 
 @functools.cache
