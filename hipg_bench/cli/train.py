@@ -17,7 +17,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run; an unfinished run in it goes on.")],
     task: Annotated[str | None, typer.Option(help="The task's name.")] = None,
     arm: Annotated[
-        str, typer.Option(help="How credit is assigned: min_health, central or local.")
+        str, typer.Option(help="MAPPO by its credit: min_health, central, local; or maddpg, qmix.")
     ] = "min_health",
     preset: Annotated[
         str, typer.Option(help="Settings to start from: recommended or paper.")
@@ -39,7 +39,7 @@ def train(
         int | None, typer.Option(min=1, help="Runs of a sweep at a time, by default one per core.")
     ] = None,
 ) -> None:
-    """Train a MAPPO team, or the many of a sweep; what was killed goes on with the same command."""
+    """Train a team, or the many of a sweep; what was killed goes on with the same command."""
     if (task is None) == (sweep is None):
         raise SpecError("train takes either --task or --sweep")
     if sweep is not None:

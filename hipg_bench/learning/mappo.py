@@ -12,7 +12,6 @@ change; truncation bootstraps, termination does not. `Settings` names each of th
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +20,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hipg_bench.env import BatchEnv, Step
-from hipg_bench.errors import ResumeError
 from hipg_bench.layout import TaskLayout
 from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
 from hipg_bench.paths import replacing
+from hipg_bench.policies.network import save_network
 from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
@@ -260,6 +259,10 @@ class Trainer:
                 error += float((value.detach() - aim[part]).square().mean()) / len(parts)
         return {"value_loss": error, "explained": 1 - error / float(aim.var())}
 
+    def save_policy(self, path: Path) -> None:
+        """Write the policy file: the mean action's network."""
+        save_network(self.actor.tensors(), path)
+
     def save(self, path: Path) -> None:
         """Write a checkpoint, whole or not at all."""
         content = {
@@ -282,15 +285,7 @@ class Trainer:
             ResumeError: the checkpoint is of a run with other settings.
         """
         content = torch.load(path, weights_only=True)
-        # a run of an older version has today's defaults in what that version did not know
-        saved = Settings(**json.loads(content["settings"])).model_dump()
-        own = self.settings.model_dump()
-        changed = {key for key in own if own[key] != saved[key]} - {"steps"}
-        if changed:
-            key = min(changed)
-            raise ResumeError(
-                f"{path} was trained with {key} = {saved[key]!r}, not {own[key]!r}: choose another --out"
-            )
+        self.settings.check_resumes(content["settings"], path)
         self.iteration = content["iteration"]
         self.actor.load_state_dict(content["actor"])
         self.critic.load_state_dict(content["critic"])

@@ -6,34 +6,87 @@ import csv
 import io
 import json
 import platform
+import shutil
 import time
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import mujoco
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from hipg_bench.learning.mappo import Trainer
-from hipg_bench.learning.settings import Settings
+from hipg_bench.errors import HipgError
+from hipg_bench.learning import mappo
+from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings
 from hipg_bench.paths import write_text
-from hipg_bench.policies.network import save_network
 from hipg_bench.registry import task_spec
 
-_SAVE_EVERY = 10
-"""Iterations between checkpoints; a kill loses fewer."""
+_REPLAY = "replay"
+"""Folder within the run's for what learners keep on disk beside checkpoints."""
 
 Log = dict[str, float]
 
 
+@runtime_checkable
+class Learner(Protocol):
+    """What carries a run from one iteration to the next.
+
+    Attributes:
+        iteration: how many are done.
+    """
+
+    iteration: int
+
+    def iterate(self) -> Log:
+        """Play and learn. Returns what to log."""
+        ...
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint, whole or not at all."""
+        ...
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint, as if never stopped; ResumeError if it is of a run with other settings."""
+        ...
+
+    def save_policy(self, path: Path) -> None:
+        """Write the policy file, whole or not at all."""
+        ...
+
+
+def new_learner(settings: AnySettings, out: Path) -> Learner:
+    """Make the settings' learner; what it keeps on disk beside checkpoints lies in ``out / "replay"``.
+
+    Raises:
+        HipgError: it is built on TorchRL, which is not installed.
+    """
+    try:
+        if isinstance(settings, MaddpgSettings):
+            from hipg_bench.learning import maddpg
+
+            return maddpg.Trainer(settings, out / _REPLAY)
+        if isinstance(settings, QmixSettings):
+            from hipg_bench.learning import qmix
+
+            return qmix.Trainer(settings, out / _REPLAY)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] not in ("torchrl", "tensordict"):
+            raise
+        raise HipgError(f"arm {settings.arm!r} needs TorchRL: pip install 'hipg-bench[torchrl]'") from error
+    return mappo.Trainer(settings)
+
+
 def train(
-    settings: Settings, out: Path, *, command: str, report: Callable[[int, Log], None] | None = None
+    settings: AnySettings, out: Path, *, command: str, report: Callable[[int, Log], None] | None = None
 ) -> None:
     """Train in a new folder, or go on where an earlier run with the same settings stopped.
 
     The folder gets ``checkpoint.pt`` (all that is needed to go on), ``policy.safetensors`` and
-    ``curve.csv`` and ``train.json`` (what an agent bundle needs), and TensorBoard events.
+    ``curve.csv`` and ``train.json`` (what an agent bundle needs), and TensorBoard events; a kill loses at
+    most one iteration. What MADDPG and QMIX replay lies in ``replay`` until they are finished: to take
+    them further than that needs a new folder.
 
     Args:
         settings: the run; ``steps`` may be larger than before.
@@ -43,32 +96,33 @@ def train(
 
     Raises:
         ResumeError: the folder holds a run with other settings.
+        HipgError: the learner is built on TorchRL, which is not installed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(settings)
+    learner = new_learner(settings, out)
     checkpoint, curve = out / "checkpoint.pt", out / "curve.csv"
     rows: list[dict[str, Any]] = []
     if checkpoint.exists():
-        trainer.resume(checkpoint)
-        rows = list(csv.DictReader(io.StringIO(curve.read_text())))[: trainer.iteration]
+        learner.resume(checkpoint)
+        rows = list(csv.DictReader(io.StringIO(curve.read_text())))[: learner.iteration]
     before = float(rows[-1]["seconds"]) if rows else 0.0
     started = time.monotonic()
-    with SummaryWriter(str(out / "tensorboard"), purge_step=trainer.iteration) as board:
-        while trainer.iteration < settings.iterations:
-            log = trainer.iterate()
+    with SummaryWriter(str(out / "tensorboard"), purge_step=learner.iteration) as board:
+        while learner.iteration < settings.iterations:
+            log = learner.iterate()
             seconds = round(before + time.monotonic() - started, 1)
-            steps = trainer.iteration * settings.num_envs * settings.rollout
-            rows.append({"iteration": trainer.iteration, "steps": steps, "seconds": seconds, **log})
+            steps = learner.iteration * settings.num_envs * settings.rollout
+            rows.append({"iteration": learner.iteration, "steps": steps, "seconds": seconds, **log})
             for name, value in log.items():
-                board.add_scalar(name, value, trainer.iteration)
+                board.add_scalar(name, value, learner.iteration)
             if report is not None:
-                report(trainer.iteration, log)
-            if trainer.iteration % _SAVE_EVERY == 0 or trainer.iteration >= settings.iterations:
-                # the checkpoint goes last: what it says was done is then on disk
-                save_network(trainer.actor.tensors(), out / "policy.safetensors")
-                write_text(curve, _table(rows))
-                write_text(out / "train.json", _record(trainer, command, steps, seconds))
-                trainer.save(checkpoint)
+                report(learner.iteration, log)
+            # the checkpoint goes last: what it says was done is then on disk
+            learner.save_policy(out / "policy.safetensors")
+            write_text(curve, _table(rows))
+            write_text(out / "train.json", _record(settings, command, steps, seconds))
+            learner.save(checkpoint)
+    shutil.rmtree(out / _REPLAY, ignore_errors=True)
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
@@ -84,15 +138,15 @@ def _table(rows: list[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
-def _record(trainer: Trainer, command: str, steps: int, seconds: float) -> str:
+def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> str:
     """Everything a model card needs to know about where the weights came from."""
-    spec = task_spec(trainer.settings.task)  # as it is scored, without the weights of training
-    content = {
+    spec = task_spec(settings.task)  # as it is scored, without the weights of training
+    content: dict[str, Any] = {
         "command": command,
         "task": spec.task,
         "task_version": spec.version,
         "task_fingerprint": spec.fingerprint,
-        "settings": trainer.settings.model_dump(),
+        "settings": settings.model_dump(),
         "env_steps": steps,
         "agent_steps": steps * spec.num_agents,
         "seconds": seconds,
@@ -104,4 +158,6 @@ def _record(trainer: Trainer, command: str, steps: int, seconds: float) -> str:
             "python": platform.python_version(),
         },
     }
+    if isinstance(settings, MaddpgSettings | QmixSettings):
+        content["versions"]["torchrl"] = metadata.version("torchrl")
     return json.dumps(content, indent=2) + "\n"

@@ -2,28 +2,75 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import pydantic
 
+from hipg_bench.errors import ResumeError, SpecError, hint
 from hipg_bench.registry import task_spec
 from hipg_bench.spec import Params, parse
 
 
-class Settings(Params):
-    """Everything that defines a training run: same settings, same result, on one machine.
+class RunSettings(Params):
+    """What every learner is told: same settings, same result, on one machine.
 
     Attributes:
         task: task name.
-        arm: how credit is assigned, a function of `hipg_bench.learning.credit`.
-        seed: fixes initial weights, worlds, exploration and minibatches; evaluation has seeds from 1000 on,
+        seed: fixes initial weights, worlds, exploration and samples; evaluation has seeds from 1000 on,
             so that nobody is scored on worlds they were trained in.
         steps: environment steps in all (each moves N agents).
         num_envs: B worlds side by side.
-        rollout: T control steps of each between updates.
+        rollout: T control steps of each in an iteration.
+        gamma: discount.
+        weights: reward weights that differ from the task's, in training only; logged returns have them.
+    """
+
+    task: str
+    seed: int = pydantic.Field(default=0, ge=0, le=999)
+    steps: int = pydantic.Field(default=6_000_000, ge=1)
+    num_envs: int = pydantic.Field(default=256, ge=1, le=65536)
+    rollout: int = pydantic.Field(default=50, ge=1, le=10_000)
+    gamma: float = pydantic.Field(default=0.98, ge=0, le=1)
+    weights: dict[str, float] = pydantic.Field(default_factory=dict[str, float])
+
+    @property
+    def iterations(self) -> int:
+        """Rollouts in all, the last one whole."""
+        return -(-self.steps // (self.num_envs * self.rollout))
+
+    def check_resumes(self, saved: str, path: Path) -> None:
+        """Refuse to go on from the checkpoint of another run.
+
+        Args:
+            saved: the checkpoint's settings as JSON; a run of an older version has today's defaults in
+                what that version did not know.
+            path: of the checkpoint, for the message.
+
+        Raises:
+            ResumeError: something other than ``steps`` differs.
+        """
+        theirs, own = json.loads(saved), self.model_dump()
+        if theirs["arm"] == own["arm"]:
+            theirs = type(self)(**theirs).model_dump()
+        changed = {name for name in own if own[name] != theirs.get(name)} - {"steps"}
+        if changed:
+            name = min(changed)
+            was = theirs.get(name)
+            raise ResumeError(
+                f"{path} was trained with {name} = {was!r}, not {own[name]!r}: choose another --out"
+            )
+
+
+class Settings(RunSettings):
+    """Everything that defines a MAPPO run.
+
+    Attributes:
+        arm: how credit is assigned, a function of `hipg_bench.learning.credit`.
         epochs, minibatches: passes over a rollout, and parts each is cut into.
-        gamma, lam: discount and GAE's lambda.
+        lam: GAE's lambda.
         clip: PPO's epsilon.
         entropy: weight of the entropy bonus.
         actor_rate: the actor's first learning rate; it then follows ``target_kl``.
@@ -33,7 +80,6 @@ class Settings(Params):
         max_grad_norm: gradients are cut to this norm.
         std: exploration's first standard deviation, in units of full action.
         actor_hidden, critic_hidden: widths of the hidden layers.
-        weights: reward weights that differ from the task's, in training only; logged returns have them.
         mask_dead: dead agents' samples take no part in the actor's update; else only the arm
             ``min_health`` leaves them without weight, as in the authors' code.
         zero_dead_actions: a dead agent's action is stored as zeros beside the log-probability of what
@@ -49,15 +95,9 @@ class Settings(Params):
             so that the critic meets the states its counterfactual is about.
     """
 
-    task: str
     arm: Literal["min_health", "central", "local"] = "min_health"
-    seed: int = pydantic.Field(default=0, ge=0, le=999)
-    steps: int = pydantic.Field(default=6_000_000, ge=1)
-    num_envs: int = pydantic.Field(default=256, ge=1, le=65536)
-    rollout: int = pydantic.Field(default=50, ge=1, le=10_000)
     epochs: int = pydantic.Field(default=5, ge=1, le=100)
     minibatches: int = pydantic.Field(default=4, ge=1, le=1000)
-    gamma: float = pydantic.Field(default=0.98, ge=0, le=1)
     lam: float = pydantic.Field(default=0.95, ge=0, le=1)
     clip: float = pydantic.Field(default=0.2, gt=0, lt=1)
     entropy: float = pydantic.Field(default=0.002, ge=0, le=1)
@@ -68,7 +108,6 @@ class Settings(Params):
     std: float = pydantic.Field(default=0.6, gt=0, le=5)
     actor_hidden: tuple[int, ...] = (128, 128)
     critic_hidden: tuple[int, ...] = (256, 256)
-    weights: dict[str, float] = pydantic.Field(default_factory=dict[str, float])
     mask_dead: bool = True
     zero_dead_actions: bool = False
     psi_over: Literal["live", "batch", "minibatch"] = "live"
@@ -78,10 +117,91 @@ class Settings(Params):
     bootstrap_truncation: bool = True
     spontaneous_deaths: float = pydantic.Field(default=0.0, ge=0, le=10)
 
-    @property
-    def iterations(self) -> int:
-        """Rollouts in all, the last one whole."""
-        return -(-self.steps // (self.num_envs * self.rollout))
+
+class ReplaySettings(RunSettings):
+    """What MADDPG and QMIX share: they learn from replayed steps.
+
+    Attributes:
+        batch: steps in a sample.
+        buffer: steps that are remembered, the latest.
+        learning_starts: steps before the first update.
+        update_every: environment steps per update.
+        rate: the optimiser's learning rate.
+        max_grad_norm: gradients are cut to this norm.
+        target_share: how far the target networks move towards the trained ones in every update.
+        hidden: widths of the hidden layers of what acts.
+        mask_dead: what a dead agent is told counts for nothing; else networks go on guessing for it.
+        normalize_inputs: running normalisation of what networks see.
+    """
+
+    num_envs: int = pydantic.Field(default=100, ge=1, le=65536)
+    batch: int = pydantic.Field(default=1024, ge=1, le=1_000_000)
+    buffer: int = pydantic.Field(default=1_000_000, ge=1, le=100_000_000)
+    learning_starts: int = pydantic.Field(default=51_200, ge=1)
+    update_every: float = pydantic.Field(default=100.0, gt=0)
+    rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
+    max_grad_norm: float = pydantic.Field(default=0.5, gt=0)
+    target_share: float = pydantic.Field(default=0.01, gt=0, le=1)
+    hidden: tuple[int, ...] = pydantic.Field(default=(64, 64), min_length=1)
+    mask_dead: bool = True
+    normalize_inputs: bool = True
+
+
+class MaddpgSettings(ReplaySettings):
+    """Everything that defines a MADDPG run (Lowe et al. 2017).
+
+    Attributes:
+        mask_dead: a dead agent's action is zero for every critic and its actor has no gradient; else only
+            stored actions are zero, as in the authors' code, and policies are still asked.
+        critic_hidden: widths of the critics' hidden layers.
+        critic_sees: beside all actions, the joint ``state`` or, as in the authors' code, all agents'
+            ``observations``.
+        noise: exploration's first standard deviation, in units of ``reach``.
+        noise_left: share of it that is left in the end.
+        noise_steps: environment steps until then.
+        saturation: weight of the mean square of the actor's outputs before they are squashed.
+        reach: full action. The authors' MADDPG pushes five times as hard as their PPO on tasks that do not
+            clip actions.
+    """
+
+    arm: Literal["maddpg"] = "maddpg"
+    critic_hidden: tuple[int, ...] = pydantic.Field(default=(64, 64), min_length=1)
+    critic_sees: Literal["state", "observations"] = "state"
+    noise: float = pydantic.Field(default=0.3, ge=0, le=2)
+    noise_left: float = pydantic.Field(default=0.3, ge=0, le=1)
+    noise_steps: int = pydantic.Field(default=500_000, ge=1)
+    saturation: float = pydantic.Field(default=1e-3, ge=0)
+    reach: float = pydantic.Field(default=1.0, gt=0, le=10)
+
+
+class QmixSettings(ReplaySettings):
+    """Everything that defines a QMIX run (Rashid et al. 2018).
+
+    Attributes:
+        mask_dead: a dead agent's values are zero, whatever it is told.
+        bins: values an action coordinate may take, evenly spaced from -1 to 1.
+        mixer_width: of the mixing network.
+        epsilon: share of random choices in the end; all are at first.
+        epsilon_steps: environment steps until then.
+    """
+
+    arm: Literal["qmix"] = "qmix"
+    bins: int = pydantic.Field(default=8, ge=2, le=256)
+    mixer_width: int = pydantic.Field(default=32, ge=1, le=4096)
+    epsilon: float = pydantic.Field(default=0.05, ge=0, le=1)
+    epsilon_steps: int = pydantic.Field(default=500_000, ge=1)
+
+
+AnySettings = Settings | MaddpgSettings | QmixSettings
+
+ARMS: Mapping[str, type[Settings] | type[MaddpgSettings] | type[QmixSettings]] = {
+    "min_health": Settings,
+    "central": Settings,
+    "local": Settings,
+    "maddpg": MaddpgSettings,
+    "qmix": QmixSettings,
+}
+"""What a run is told, by arm."""
 
 
 _BY_FAMILY: Mapping[str, dict[str, Any]] = {
@@ -94,17 +214,26 @@ _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """Where a family does better with other values than the defaults."""
+_MADDPG_BY_FAMILY: Mapping[str, dict[str, Any]] = {}
+_QMIX_BY_FAMILY: Mapping[str, dict[str, Any]] = {}
 
 
-def recommended(task: str, **changes: Any) -> Settings:
-    """The recommended settings for a task, with some changed.
+def recommended(task: str, **changes: Any) -> AnySettings:
+    """The recommended settings for a task, with some changed; ``arm`` says for which learner.
 
     Raises:
         UnknownNameError: no such task.
-        SpecError: a setting that is not allowed.
+        SpecError: no such arm, or a setting that is not allowed.
     """
-    values = {"task": task, **_BY_FAMILY.get(task_spec(task).family, {}), **changes}
-    return parse(Settings, values, f"training {task}")
+    family, arm = task_spec(task).family, changes.get("arm", "min_health")
+    by_family = {"maddpg": _MADDPG_BY_FAMILY, "qmix": _QMIX_BY_FAMILY}.get(arm, _BY_FAMILY)
+    return _parsed(task, arm, {**by_family.get(family, {}), **changes})
+
+
+def _parsed(task: str, arm: str, values: dict[str, Any]) -> AnySettings:
+    if arm not in ARMS:
+        raise SpecError(f"training {task}: no arm {arm!r}{hint(str(arm), ARMS)}")
+    return parse(ARMS[arm], {"task": task, "arm": arm, **values}, f"training {task}")
 
 
 _PAPER: dict[str, Any] = {
@@ -126,22 +255,43 @@ _PAPER_WALKERS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def paper(task: str, **changes: Any) -> Settings:
+_PAPER_MADDPG: dict[str, Any] = {
+    "steps": 2_500_000, "gamma": 0.95, "rate": 1e-2, "mask_dead": False, "normalize_inputs": False,
+    "critic_sees": "observations",
+}  # fmt: skip
+_PAPER_QMIX: dict[str, Any] = {
+    "steps": 5_000_000, "gamma": 0.99, "batch": 100, "buffer": 100_000, "learning_starts": 1000,
+    "update_every": 100, "rate": 5e-4, "max_grad_norm": 10.0, "target_share": 0.2, "epsilon": 0.02,
+    "epsilon_steps": 10_000, "mask_dead": False, "normalize_inputs": False,
+}  # fmt: skip
+
+
+def paper(task: str, **changes: Any) -> AnySettings:
     """The paper's settings, with the quirks of the authors' code, with some changed.
 
     Source: facts sheet, section 5 (particles) and section 6c (walkers, where gamma, lambda, clip and
     value clip are not stated and RLlib's defaults of the time are taken). The critic is told the share
     of the horizon that has passed where the authors feed the number of steps left.
 
+    Of MADDPG the sheet gives everything but the learning rate, which is the default of the authors' code;
+    its soft choice among five directions is a continuous push here, with Gaussian noise. Of QMIX the
+    paper states the number of bins alone; the rest are RLlib's defaults of the time, where an update is of
+    one whole episode (about 100 steps here) and follows each episode, but without recurrence, and with
+    targets that follow smoothly where RLlib copies them every 500 steps.
+
     Raises:
         UnknownNameError: no such task.
-        SpecError: a setting that is not allowed.
+        SpecError: no such arm, or a setting that is not allowed.
     """
-    walkers = _PAPER_WALKERS if task_spec(task).family == "multiwalker" else {}
-    arm = changes.get("arm", "min_health")
-    values = {"task": task, **_PAPER, **walkers, **_PAPER_ARMS.get(arm, {}), **changes}
-    return parse(Settings, values, f"training {task}")
+    spec, arm = task_spec(task), changes.get("arm", "min_health")
+    if arm == "maddpg":
+        reach = 1.0 if spec.clip_actions else 5.0
+        return _parsed(task, arm, {**_PAPER_MADDPG, "reach": reach, **changes})
+    if arm == "qmix":
+        return _parsed(task, arm, {**_PAPER_QMIX, **changes})
+    walkers = _PAPER_WALKERS if spec.family == "multiwalker" else {}
+    return _parsed(task, arm, {**_PAPER, **walkers, **_PAPER_ARMS.get(arm, {}), **changes})
 
 
-PRESETS: Mapping[str, Callable[..., Settings]] = {"recommended": recommended, "paper": paper}
+PRESETS: Mapping[str, Callable[..., AnySettings]] = {"recommended": recommended, "paper": paper}
 """Ready-made settings by name."""

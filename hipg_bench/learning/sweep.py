@@ -29,7 +29,7 @@ import torch
 
 from hipg_bench.errors import SpecError
 from hipg_bench.learning.run import train
-from hipg_bench.learning.settings import PRESETS, Settings
+from hipg_bench.learning.settings import PRESETS, AnySettings
 from hipg_bench.spec import Params, parse
 
 _LOOK_EVERY = 5.0
@@ -56,7 +56,7 @@ class Sweep(Params):
 class Run(NamedTuple):
     """One run of a sweep."""
 
-    settings: Settings
+    settings: AnySettings
     out: Path
     command: str
 
@@ -126,6 +126,6 @@ def _runs(group: Group, out: Path) -> Iterator[Run]:
         yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]))
 
 
-def _train(settings: Settings, out: Path, command: str) -> None:
+def _train(settings: AnySettings, out: Path, command: str) -> None:
     torch.set_num_threads(1)
     train(settings, out, command=command)

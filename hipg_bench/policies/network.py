@@ -7,6 +7,7 @@ product's last bits depend on the batch size, and results must not.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -22,7 +23,10 @@ from hipg_bench.paths import replacing
 from hipg_bench.spec import Params, parse
 
 FORMAT = "hipg-mlp-2"
-"""What the metadata's ``format`` says: an MLP over normalised observations, whose `Form` stands beside."""
+"""How the metadata's ``format`` begins: an MLP over normalised observations; its `Form` follows as JSON.
+
+One entry holds both: several would be written in an order that changes from file to file.
+"""
 _FIRST_FORMAT = "hipg-mlp-1"
 """The same without a `Form`: all its defaults."""
 CLIP = 10.0
@@ -123,9 +127,8 @@ def save_network(tensors: Mapping[str, np.ndarray], path: Path, form: Form = _SH
         form: the network's.
     """
     plain = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
-    declared = {name: str(value) for name, value in form.model_dump().items()}
     with replacing(path) as temporary:
-        save_file(plain, temporary, {"format": FORMAT, **declared})
+        save_file(plain, temporary, {"format": f"{FORMAT} {form.model_dump_json()}"})
 
 
 def load_network(path: Path) -> MLP:
@@ -137,7 +140,7 @@ def load_network(path: Path) -> MLP:
     """
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            form = _declared_form(path, dict(file.metadata() or {}))
+            form = _declared_form(path, (file.metadata() or {}).get("format", ""))
             names = sorted(file.keys())
             shapes = {name: tuple(file.get_slice(name).get_shape()) for name in names}
             _check_shapes(path, shapes, form)
@@ -154,15 +157,15 @@ def load_network(path: Path) -> MLP:
     return MLP(tensors, form)
 
 
-def _declared_form(path: Path, metadata: dict[str, str]) -> Form:
-    """Read the metadata."""
-    declared = metadata.pop("format", None)
-    if declared not in (FORMAT, _FIRST_FORMAT):
-        raise BundleError(f"{path}: formats {_FIRST_FORMAT!r} and {FORMAT!r} are allowed, got {declared!r}")
+def _declared_form(path: Path, declared: str) -> Form:
+    """Read the metadata's ``format``."""
+    name, _, text = declared.partition(" ")
+    if name not in (FORMAT, _FIRST_FORMAT):
+        raise BundleError(f"{path}: formats {_FIRST_FORMAT!r} and {FORMAT!r} are allowed, got {name!r}")
     try:
-        form = parse(Form, metadata if declared == FORMAT else {}, str(path))
-    except SpecError as error:
-        raise BundleError(str(error)) from error
+        form = parse(Form, json.loads(text) if name == FORMAT else {}, str(path))
+    except (SpecError, TypeError, RecursionError, json.JSONDecodeError) as error:
+        raise BundleError(f"{path}: its form {text!r} is refused: {error}") from error
     if (form.head == "bins") != (form.bins >= 2):
         raise BundleError(f"{path}: 2 or more bins belong to the head 'bins', got {form.bins}, {form.head!r}")
     return form
