@@ -2,7 +2,7 @@
 #   make evaluate AGENT=random ARGS="--quick"
 #   make test ARGS="-k laws"
 .DEFAULT_GOAL := help
-.PHONY: help setup evaluate test lint format bench golden clean
+.PHONY: help setup evaluate test test-rllib test-benchmarl lint format bench bench-peers golden clean
 
 BIN := .venv/bin
 READY := .venv/.ready
@@ -10,7 +10,7 @@ AGENT ?= mappo_minhealth
 ARGS ?=
 
 help: ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
 
 setup: $(READY) ## virtual environment, pinned packages, libraries for video
 
@@ -23,6 +23,12 @@ evaluate: $(READY) ## score an agent on the standard suite, with films
 test: $(READY) ## the tests, some minutes
 	$(BIN)/pytest $(ARGS)
 
+test-rllib: ## the RLlib face, in an environment of its own
+	scripts/test_beside.sh rllib $(ARGS)
+
+test-benchmarl: ## the BenchMARL plug-in, in an environment of its own
+	scripts/test_beside.sh benchmarl $(ARGS)
+
 lint: $(READY) ## style, types, layers, spelling
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -34,8 +40,11 @@ format: $(READY) ## mend style where a tool can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(READY) ## environment steps per second
+bench: $(READY) ## speed and memory, beside what bounds them; ARGS="--full --plot speed.png" for all of it
 	$(BIN)/hipg-bench bench $(ARGS)
+
+bench-peers: $(READY) ## our speed beside VMAS, JaxMARL, PettingZoo, MaMuJoCo and TorchRL, in .venv-peers
+	scripts/bench_peers.sh $(ARGS)
 
 golden: $(READY) ## record the golden episodes anew, after a wanted change of behaviour
 	$(BIN)/pytest tests/test_golden.py --record-golden
