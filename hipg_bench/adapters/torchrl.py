@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -93,8 +93,7 @@ class HipgEnv(EnvBase):
             step = env.load_rows(still, rows)
             reward[still], ends[:, still] = 0.0, self._ends[:, still]
         self._ends = ends
-        paid = torch.from_numpy(reward[..., None].astype(np.float32))
-        return self._tensors(step).set(("agents", "reward"), paid)
+        return self._tensors(step, reward=reward[..., None].astype(np.float32))
 
     def _named(self, tensordict: TensorDictBase | None, mask: str) -> Bool[np.ndarray, "B"]:
         named = None if tensordict is None else tensordict.get(mask, None)
@@ -103,16 +102,17 @@ class HipgEnv(EnvBase):
     def _all(self, **of_one_world: Any) -> Composite:
         return Composite(of_one_world).expand(self.batch_size).to(self.device)
 
-    def _tensors(self, step: Step) -> TensorDict:
+    def _tensors(self, step: Step, **paid: Float[np.ndarray, "B N 1"]) -> TensorDict:
         """What is seen now, and what is over; a step's arrays are the caller's, so none is copied."""
-        self._alive, terminated, truncated = step.info["final_alive"], *self._ends
-        agents = {"observation": step.observation, "alive": step.info["alive"][..., None]}
+        self._alive, ends = step.info["final_alive"], torch.from_numpy(self._ends[:, :, None].copy())
+        agents = {"observation": step.observation, "alive": step.info["alive"][..., None], **paid}
+        tensors = {name: torch.from_numpy(array) for name, array in agents.items()}
         shown = {
-            "agents": TensorDict(agents, step.info["alive"].shape, self.device),
-            "state": step.info["state"],
-            "done": (terminated | truncated)[:, None],
-            "terminated": terminated[:, None].copy(),
-            "truncated": truncated[:, None].copy(),
+            "agents": TensorDict(tensors, self._alive.shape, self.device),
+            "state": torch.from_numpy(step.info["state"]),
+            "done": ends.any(0),
+            "terminated": ends[0],
+            "truncated": ends[1],
         }
         return TensorDict(shown, self.batch_size, self.device)
 
