@@ -149,6 +149,7 @@ def test_running_norm_matches_all_data_at_once() -> None:
     norm = RunningNorm(4, fixed=np.array([2]))
     for part in parts:
         norm.update(torch.from_numpy(part))
+        norm.update(torch.empty(0, 4))  # a step at which nobody was alive
     together = np.concatenate(parts)
     free = [0, 1, 3]
     np.testing.assert_allclose(norm.offset.numpy()[free], together.mean(0)[free], atol=1e-3)

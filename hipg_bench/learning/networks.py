@@ -37,7 +37,9 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Float[Tensor, "X size"]) -> None:
-        """Take in a batch."""
+        """Take in a batch, perhaps an empty one."""
+        if len(x) == 0:
+            return
         x = x.double()
         fresh = x.mean(0) - self.mean
         total = self.count + len(x)
