@@ -1,18 +1,52 @@
 """What the README shows works as shown."""
 
+import importlib.util
 import re
 from pathlib import Path
 
+import pytest
+
 README = Path(__file__).parent.parent / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+FACES = {
+    "PettingZoo": "pettingzoo",
+    "Gymnasium": "gymnasium",
+    "dm_control": "dm_control",
+    "TorchRL": "torchrl",
+    "Stable-Baselines3": "stable_baselines3",
+    "RLlib": "ray",
+    "BenchMARL": "benchmarl",
+}
+"""How a block on a face begins, and the library it needs."""
+
+
+def block_on(face: str) -> str:
+    (code,) = [block for block in BLOCKS if re.match(rf"# {face}\b", block)]
+    return code
 
 
 def test_the_python_example_runs_and_prints_a_return_and_deaths(capsys) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    (code,) = [block for block in BLOCKS if not block.startswith("# ")]
     exec(compile(code, README, "exec"), {})
     episode_return, deaths = map(float, capsys.readouterr().out.split())
     # anchor of random play in the task file: -30.3; 64 episodes with a deviation of about 3.4 each
     assert abs(episode_return + 30.3) < 3
     assert 0 < deaths < 8
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_five_lines_are_enough_for_every_face(face: str, tmp_path, monkeypatch) -> None:
+    code = block_on(face)
+    assert len(code.splitlines()) <= 7, "a comment, imports and five lines"
+    if importlib.util.find_spec(FACES[face]) is None:
+        pytest.skip(f"{FACES[face]} is not installed here")
+    monkeypatch.chdir(tmp_path)
+    shown: dict[str, object] = {}
+    exec(compile(code, README, "exec"), shown)
+    if face == "PettingZoo":
+        assert shown["env"].agents == []
+    if face == "RLlib":
+        assert set(shown["config"].build_algo().train()["env_runners"]) >= {"episode_return_mean"}
 
 
 def test_every_command_shown_exists() -> None:
