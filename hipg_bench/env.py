@@ -350,9 +350,12 @@ class BatchEnv:
         # a sum is finite only if all its terms are
         if not np.isfinite(action.sum()):
             self._refuse_infinite(action, alive)
+        if self.spec.clip_actions:
+            action = action.clip(-1.0, 1.0)
         if not alive.all():
-            action = np.where(alive[:, :, None], action, 0.0)
-        return action.clip(-1.0, 1.0) if self.spec.clip_actions else action
+            action = action.copy()
+            action[~alive] = 0.0
+        return action
 
     def _refuse_infinite(self, action: Float[np.ndarray, "B N A"], alive: Bool[np.ndarray, "B N"]) -> None:
         """Raise if somebody alive is told a number that is not finite."""

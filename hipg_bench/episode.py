@@ -28,11 +28,15 @@ def memory_fields(spec: TaskSpec, family: Family) -> dict[str, int]:
 
 def draw(seed: int, episodes: Int[np.ndarray, "n"], size: int) -> Float[np.ndarray, "n size"]:
     """All chance of some episodes: uniform numbers that depend on the seed and the episode alone."""
-    # the episode takes the counter's highest word: draws advance the lowest, so streams never meet
-    return np.stack([
-        np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, episode])).random(size)
-        for episode in episodes.tolist()
-    ])  # fmt: skip
+    philox = np.random.Philox(key=seed)
+    generator, start = np.random.Generator(philox), philox.state
+    chance = np.empty((len(episodes), size))
+    for row, episode in zip(chance, episodes.tolist(), strict=True):
+        # the episode takes the counter's highest word: draws advance the lowest, so streams never meet
+        start["state"]["counter"][3] = episode
+        philox.state = start
+        generator.random(out=row)
+    return chance
 
 
 def measure(

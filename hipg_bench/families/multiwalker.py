@@ -10,6 +10,7 @@ walkers fell, or at the horizon.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 import mujoco
@@ -19,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from hipg_bench.families import walker_body
 from hipg_bench.families.family import EVERY, Harm, Rows
-from hipg_bench.families.walker_body import Pose
+from hipg_bench.families.walker_body import Body, Pose
 from hipg_bench.layout import Block, Layout, TaskLayout
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params as BaseParams
@@ -57,16 +58,22 @@ class Params(BaseParams):
     drop_height: float = pydantic.Field(ge=0, le=0.5)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Snapshot:
     """The world at the end of a control step."""
 
+    body: Body
     pose: Pose
-    touch: Bool[np.ndarray, "B N 2"]  # feet on the ground
     action: Float[np.ndarray, "B N A"]  # the last one
     health: Float[np.ndarray, "B N"]
     down: Float[np.ndarray, "B N"]  # control steps in a row tipped or sunk
     plank_low: Float[np.ndarray, "B"]  # height of the plank's lowest corner, m
+
+    @functools.cached_property
+    def touch(self) -> Bool[np.ndarray, "B N 2"]:
+        """Feet on the ground."""
+        sole = walker_body.sole_height(self.body, self.pose.rotation[:, :-1], self.pose.joint)
+        return self.pose.position[:, :-1, 2, None] + sole < _TOUCH
 
 
 class MultiWalker:
@@ -109,15 +116,14 @@ class MultiWalker:
     def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
         """Everything follows from the generalised coordinates, which do not lag behind the physics."""
         pose = walker_body.pose(self.body, sim, rows)
-        sole = walker_body.sole_height(self.body, pose.rotation[:, :-1], pose.joint)
-        corner = pose.rotation[:, -1, 2] @ self._corners.T
+        x, y, z = (pose.rotation[:, -1, 2, k, None] * self._corners[:, k] for k in range(3))
         return Snapshot(
+            body=self.body,
             pose=pose,
-            touch=pose.position[:, :-1, 2, None] + sole < _TOUCH,
-            action=sim.control[rows].reshape(len(sole), -1, self._servos).copy(),
+            action=sim.control[rows].reshape(len(pose.position), -1, self._servos).copy(),
             health=sim.field["health"][rows].copy(),
             down=sim.field["down"][rows].copy(),
-            plank_low=pose.position[:, -1, 2] + corner.min(axis=1),
+            plank_low=pose.position[:, -1, 2] + (x + y + z).min(axis=1),
         )
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
@@ -135,7 +141,8 @@ class MultiWalker:
         carried = np.where(live, moved[:, :-1], 0.0).sum(axis=1) / np.maximum(live.sum(axis=1), 1)
         sim.field["displacement"][:, 0] += moved[:, -1]
         sim.field["slip"][:, 0] += moved[:, -1] - carried
-        return dataclasses.replace(now, down=down)
+        now.down = down
+        return now
 
     def reward(self, was: Snapshot, now: Snapshot) -> dict[str, Float[np.ndarray, "B"]]:
         """Terms of the step.
@@ -147,18 +154,19 @@ class MultiWalker:
         """
         moved = now.pose.position[:, -1, 0] - was.pose.position[:, -1, 0]
         fell = (was.health > 0) & (now.health == 0)
+        n = self.spec.num_agents
         return {
             "progress": np.minimum(moved, self.params.speed_cap * self.spec.control_step),
-            "fall": fell.mean(axis=1),
-            "drop": self.terminated(now)[0].astype(np.float64),
+            "fall": fell.sum(axis=1) / n,
+            "drop": (self._dropped(now) | self._fallen(now)).astype(np.float64),
             "effort": np.square(now.action).mean(axis=(1, 2)),
             "jerk": np.square(now.action - was.action).mean(axis=(1, 2)),
-            "alive": (now.health > 0).mean(axis=1),
+            "alive": (now.health > 0).sum(axis=1) / n,
         }
 
-    def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], np.ndarray]:
+    def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], str | np.ndarray]:
         """When the plank is on the ground, or nobody is left to carry it."""
-        dropped, fallen = self._dropped(now), (now.health == 0).all(axis=1)
+        dropped, fallen = self._dropped(now), self._fallen(now)
         return dropped | fallen, np.where(dropped, "dropped", "all_fallen")
 
     def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
@@ -222,6 +230,9 @@ class MultiWalker:
     def _dropped(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
         return now.plank_low < self.params.drop_height
 
+    def _fallen(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
+        return (now.health == 0).all(axis=1)
+
     def _proprioception(self, now: Snapshot) -> dict[str, np.ndarray]:
         """What each walker feels of its own body; the blocks of `_proprioception_blocks`."""
         pose = now.pose
@@ -255,19 +266,22 @@ class MultiWalker:
 
     def _neighbors(self, now: Snapshot) -> dict[str, np.ndarray]:
         """The walkers behind and before each one: gap beyond the seats' spacing, and relative velocity."""
-        position, velocity = now.pose.position[:, :-1], now.pose.velocity[:, :-1]
-        n = position.shape[1]
-        other = np.arange(n)[:, None] + np.array([-1, 1])
-        there = (other >= 0) & (other < n)
-        other = np.where(there, other, 0)
-        gap = position[:, other] - position[:, :, None]
-        gap[..., 0] -= self.params.spacing * np.array([-1.0, 1.0])
-        speed = velocity[:, other] - velocity[:, :, None]
+        count, n = now.health.shape
+        there, health = np.zeros((n, 2)), np.zeros((count, n, 2))
+        gap, speed = np.zeros((2, count, n, 2, 3))
+        # the one behind, and the one ahead
+        for side, own, other in ((0, slice(1, n), slice(0, n - 1)), (1, slice(0, n - 1), slice(1, n))):
+            there[own, side] = 1
+            health[:, own, side] = now.health[:, other]
+            gap[:, own, side] = now.pose.position[:, other] - now.pose.position[:, own]
+            speed[:, own, side] = now.pose.velocity[:, other] - now.pose.velocity[:, own]
+        gap[:, 1:, 0, 0] += self.params.spacing
+        gap[:, :-1, 1, 0] -= self.params.spacing
         return {
             "neighbor_there": there,
-            "neighbor_health": np.where(there, now.health[:, other], 0.0),
-            "neighbor_gap": np.where(there[..., None], gap[..., self._axes], 0.0),
-            "neighbor_velocity": np.where(there[..., None], speed[..., self._axes], 0.0),
+            "neighbor_health": health,
+            "neighbor_gap": gap[..., self._axes],
+            "neighbor_velocity": speed[..., self._axes],
         }
 
     def _observation(self) -> Layout:

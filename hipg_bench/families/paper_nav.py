@@ -46,7 +46,6 @@ class Snapshot(particles.Snapshot):
 
     hazardous: Bool[np.ndarray, "B L"]
     revealed: Bool[np.ndarray, "B L"]  # hazardous, and known to be
-    past_revealed: Bool[np.ndarray, "B L"]
     # once it is known who died
     gap: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # sum over safe landmarks to an agent, m
     collision: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # overlapping pairs of the living
@@ -110,7 +109,6 @@ class PaperNav(particles.Particles[Snapshot]):
         return Snapshot(
             hazardous=hazardous,
             revealed=sim.field["revealed"][rows] > 0,
-            past_revealed=sim.field["past_revealed"][rows] > 0,
             **self._bodies(sim, rows, hazardous),
         )
 
@@ -118,7 +116,6 @@ class PaperNav(particles.Particles[Snapshot]):
         """A hazard is revealed for good once an agent, dead or alive, is within its radius."""
         world, _, point = now.exposed
         now.revealed[world, point] = True
-        now.past_revealed = was.revealed
         both, single = self._overlaps(now, now.health > 0)
         now.collision, now.dead_overlap = self._per_world(now, both), self._per_world(now, single)
         now.gap = self._gap(now)
@@ -197,8 +194,9 @@ class PaperNav(particles.Particles[Snapshot]):
         hazard = self._nearest_revealed(now)
         return senses.look(self._look_layout, now, shown=~now.revealed, hazard_position=hazard)
 
-    def _before(self, now: Snapshot, past: particles.Past) -> Snapshot:
-        return dataclasses.replace(super()._before(now, past), revealed=now.past_revealed)
+    def _before(self, now: Snapshot) -> Snapshot:
+        sim, rows = now.source
+        return dataclasses.replace(super()._before(now), revealed=sim.field["past_revealed"][rows] > 0)
 
     def _nearest_revealed(self, now: Snapshot) -> Float[np.ndarray, "n N 2"]:
         """Relative position of the nearest revealed hazard, m; zeros before one is known."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from hipg_bench.families.family import Harm, Rows
 from hipg_bench.families.scene import add_marker, asset, attach
-from hipg_bench.layout import Block, Layout
+from hipg_bench.layout import Block, Layout, TaskLayout
 from hipg_bench.mechanics import hazards, pairs
 from hipg_bench.mechanics import health as health_law
 from hipg_bench.mechanics.pairs import Contacts, Gaps
@@ -60,16 +60,6 @@ class ParticleParams(Params):
     observation: Literal["direct", "histogram"]
 
 
-class Past(NamedTuple):
-    """What the previous control step left behind, from which its histogram is counted again."""
-
-    position: Float[np.ndarray, "B N 2"]
-    velocity: Float[np.ndarray, "B N 2"]
-    health: Float[np.ndarray, "B N"]
-    exists: Bool[np.ndarray, "B"]
-    """False in an episode's first observation."""
-
-
 @dataclasses.dataclass(kw_only=True)
 class Snapshot:
     """The world at the end of a control step, as far as both families have the same."""
@@ -81,7 +71,7 @@ class Snapshot:
     gaps: Gaps  # agents to agents, and to points
     contacts: Contacts  # agents that push each other, if they live
     exposed: tuple[Int[np.ndarray, "M"], ...]  # world, agent, point: the M cases of an agent in a hazard
-    past: Past | None  # with the histogram observation
+    source: tuple[Sim, Rows]  # from where it was read
     look: Float32[np.ndarray, "B N K"] | None = None  # this step's part of the histogram observation
     past_look: Float32[np.ndarray, "B N K"] | None = None  # the previous step's; both counted once only
 
@@ -96,6 +86,7 @@ class Particles(abc.ABC, Generic[S]):
         radius: of an agent, m.
     """
 
+    layout: TaskLayout
     causes: tuple[str, ...] = CAUSES
     physics_steps: int = 1
 
@@ -135,7 +126,10 @@ class Particles(abc.ABC, Generic[S]):
         """Points and other agents, listed or counted."""
         if self._direct:
             return self._list(now)
-        return np.concatenate([self._look(now), self._look_back(now)], axis=-1)
+        now_and_then = np.empty((*now.health.shape, self.layout.observation.size), np.float32)
+        half = now_and_then.shape[-1] // 2
+        now_and_then[..., :half], now_and_then[..., half:] = self._look(now), self._look_back(now)
+        return now_and_then
 
     @abc.abstractmethod
     def _list(self, now: S) -> Float[np.ndarray, "n N O"]:
@@ -145,14 +139,17 @@ class Particles(abc.ABC, Generic[S]):
     def _count(self, now: S) -> Float[np.ndarray, "n N K"]:
         """One control step's part of the histogram observation."""
 
-    def _before(self, now: S, past: Past) -> S:
-        """The previous control step, as far as its part of the histogram observation needs it."""
+    def _before(self, now: S) -> S:
+        """The control step before, as the rows remember it, as far as its part of the observation needs."""
+        sim, rows = now.source
+        field, shape = sim.field, now.position.shape
+        position = field["past_position"][rows].reshape(shape)
         return dataclasses.replace(
             now,
-            position=past.position,
-            velocity=past.velocity,
-            health=past.health,
-            gaps=pairs.gaps(past.position, now.point),
+            position=position,
+            velocity=field["past_velocity"][rows].reshape(shape),
+            health=field["past_health"][rows],
+            gaps=pairs.gaps(position, now.point),
         )
 
     def _look(self, now: S) -> Float[np.ndarray, "n N K"]:
@@ -164,13 +161,11 @@ class Particles(abc.ABC, Generic[S]):
     def _look_back(self, now: S) -> Float[np.ndarray, "n N K"]:
         """The previous step's part; where nobody kept it, from what the rows remember; zeros at first."""
         if now.past_look is None:
-            past = now.past
-            if past is None:
-                raise ValueError("a direct observation does not look back")
+            sim, rows = now.source
+            begun = sim.field["elapsed"][rows, 0] > 0
             now.past_look = np.zeros_like(self._look(now))
-            if past.exists.any():
-                seen = self._count(self._before(now, past))
-                now.past_look[past.exists] = seen[past.exists]
+            if begun.any():
+                now.past_look[begun] = self._count(self._before(now))[begun]
         return now.past_look
 
     def _bodies(self, sim: Sim, rows: Rows, hazardous: Bool[np.ndarray, "n L"]) -> dict[str, Any]:
@@ -200,18 +195,8 @@ class Particles(abc.ABC, Generic[S]):
             "gaps": gaps,
             "contacts": pairs.contacts(gaps, 2 * self.radius, self._law.contact_margin),
             "exposed": (world[harmful], agent[harmful], where[harmful]),
-            "past": None if self._direct else self._past(sim, rows),
+            "source": (sim, rows),
         }
-
-    def _past(self, sim: Sim, rows: Rows) -> Past:
-        """The previous control step, as the rows remember it."""
-        field, n = sim.field, self.spec.num_agents
-        return Past(
-            position=field["past_position"][rows].reshape(-1, n, 2).copy(),
-            velocity=field["past_velocity"][rows].reshape(-1, n, 2).copy(),
-            health=field["past_health"][rows].copy(),
-            exists=field["elapsed"][rows, 0] > 0,
-        )
 
     def _keep(self, sim: Sim, was: S, now: S) -> None:
         """Write what outlives the step: the velocity that the dead keep, and the step if it is seen again."""
