@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from hipg_bench import BatchEnv, make
+from hipg_bench.families.drones import pack
+from hipg_bench.layout import Block, Layout
 from hipg_bench.policies.scripted import Scripted
 
 
@@ -119,3 +121,18 @@ def test_the_expert_beats_random_by_far(task: str) -> None:
             step = env.step(action)
         returns[name] = step.info["metrics"]["return"]
     assert returns["expert"].min() > np.median(returns["random"])
+
+
+@pytest.mark.parametrize("lead", [(5, 3), (64, 3), (4,)])
+def test_packing_with_the_worlds_last_is_packing(lead: tuple[int, ...]) -> None:
+    layout = Layout((Block("a", (1,), "1"), Block("b", (2, 3), "m"), Block("c", (4,), "m")))
+    rng = np.random.default_rng(0)
+    parts = {block.name: rng.normal(size=(*lead, *block.shape)) for block in layout.blocks}
+    # lead axes in reverse behind the block's: (B, N, *shape) becomes (*shape, N, B)
+    turned = {
+        name: np.moveaxis(part, range(len(lead)), range(-1, -1 - len(lead), -1))
+        for name, part in parts.items()
+    }
+    assert (pack(layout, turned, lead) == layout.pack(parts, lead)).all()
+    with pytest.raises(ValueError, match="do not match the blocks"):
+        pack(layout, {"a": turned["a"]}, lead)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 import pydantic
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.families.scene import asset, attach
@@ -81,11 +81,16 @@ def place(sim: Sim, ids: Int[np.ndarray, "n"], position: Float[np.ndarray, "n N 
 
 def kinematics(
     sim: Sim, num_agents: int, rows: Rows = EVERY
-) -> tuple[Float[np.ndarray, "n N 3"], Float[np.ndarray, "n N 3"]]:
-    """Copies of the drones' positions (m) and velocities (m/s)."""
+) -> tuple[Float[np.ndarray, "3 N n"], Float[np.ndarray, "3 N n"]]:
+    """Copies of the drones' positions (m) and velocities (m/s), worlds last."""
     position = sim.position[rows].reshape(-1, num_agents, 3)
     velocity = sim.velocity[rows].reshape(-1, num_agents, 3)
-    return position.copy(), velocity.copy()
+    return position.T.copy(), velocity.T.copy()
+
+
+def living(health: Float[np.ndarray, "n N"]) -> Bool[np.ndarray, "N n"]:
+    """Who lives, worlds last."""
+    return health.T.copy() > 0
 
 
 def spread(
@@ -94,8 +99,7 @@ def spread(
     """Of C candidate placements in a box, the one whose nearest pair is farthest apart."""
     place = np.asarray(low) + chance * (np.asarray(high) - np.asarray(low))
     n, c, p, _ = place.shape
-    gap = coverage.distances(place.reshape(n * c, p, 3), place.reshape(n * c, p, 3))
-    gap = np.where(np.eye(p, dtype=bool), np.inf, gap).min(axis=(1, 2)).reshape(n, c)
+    gap = coverage.apart(place.reshape(n * c, p, 3).T).min(axis=(0, 1)).reshape(n, c)
     return place[np.arange(n), gap.argmax(axis=1)]
 
 
@@ -109,37 +113,50 @@ def neighbor_blocks(slots: int, visible: str) -> tuple[Block, ...]:
     )
 
 
-@functools.cache
-def _others(num_agents: int) -> np.ndarray:
-    """(1, N, N) True off the diagonal."""
-    return ~np.eye(num_agents, dtype=bool)[None]
-
-
 def neighbors(
-    apart: Float[np.ndarray, "n N N"],
-    position: Float[np.ndarray, "n N 3"],
-    velocity: Float[np.ndarray, "n N 3"],
+    sensed: sensing.Sensed,
+    position: Float[np.ndarray, "3 N n"],
+    velocity: Float[np.ndarray, "3 N n"],
     health: Float[np.ndarray, "n N"],
-    radius: float,
-    slots: int,
-    *,
-    live_only: bool = False,
 ) -> dict[str, np.ndarray]:
-    """What each drone senses of the nearest other drones, dead ones included unless ``live_only``.
-
-    Returns:
-        The blocks of `neighbor_blocks`.
-    """
-    visible = _others(position.shape[1])
-    if live_only:
-        visible = visible & (health > 0)[:, None, :]
-    sensed = sensing.nearest_within(apart, visible, radius, slots)
-    of = np.concatenate([position, velocity, health[..., None]], axis=-1)
-    own = np.concatenate([position, velocity, np.zeros_like(health)[..., None]], axis=-1)
-    found = np.where(sensed.seen[..., None], sensing.gather(of, sensed) - own[:, :, None], 0.0)
+    """What each drone perceives of those that it senses: the blocks of `neighbor_blocks`, worlds last."""
+    place, seen = sensed
     return {
-        "neighbor_seen": sensed.seen,
-        "neighbor_health": found[..., 6],
-        "neighbor_position": found[..., 0:3],
-        "neighbor_velocity": found[..., 3:6],
+        "neighbor_seen": seen,
+        "neighbor_health": sensing.look_up(health.T[None], place)[0] * seen,
+        "neighbor_position": relative(position, place, position),
+        "neighbor_velocity": relative(velocity, place, velocity),
     }
+
+
+def relative(
+    table: Float[np.ndarray, "3 M n"], place: Int[np.ndarray, "K N n"], own: Float[np.ndarray, "3 N n"]
+) -> Float[np.ndarray, "K 3 N n"]:
+    """What fills each drone's slots, relative to its own."""
+    found = sensing.look_up(table, place)
+    found -= own[:, None]
+    return found.swapaxes(0, 1)
+
+
+def pack(
+    layout: Layout, parts: Mapping[str, np.ndarray], lead: tuple[int, ...]
+) -> Float[np.ndarray, "n *lead size"]:
+    """As `Layout.pack`, from parts of shape ``(*block.shape, *lead, n)``: worlds last.
+
+    Args:
+        layout: of observations, or of the joint state.
+        parts: one array per block.
+        lead: n, and N for observations.
+
+    Raises:
+        ValueError: the names are not exactly those of the blocks.
+    """
+    if parts.keys() != layout.slices.keys():
+        raise ValueError(f"parts {sorted(parts)} do not match the blocks {sorted(layout.slices)}")
+    worlds, *agents = lead
+    # a little longer than the worlds: rows a power of two apart evict each other from the cache
+    flat = np.empty((layout.size, *agents, worlds + 16), np.float32)[..., :worlds]
+    for block in layout.blocks:
+        rows = flat[layout.slices[block.name]]
+        rows.reshape(*block.shape, *rows.shape[1:], copy=False)[...] = parts[block.name]
+    return np.ascontiguousarray(flat.T)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 import pydantic
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8
 
 from hipg_bench.families import drones
 from hipg_bench.families.family import EVERY, Harm, Rows
@@ -50,16 +50,18 @@ class Params(drones.DroneParams):
     wrecks: int = pydantic.Field(ge=1, le=30)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(kw_only=True)
 class Snapshot:
-    """The world at the end of a control step."""
+    """The world at the end of a control step; all but health has the worlds last."""
 
-    position: Float[np.ndarray, "B N 3"]  # m
-    velocity: Float[np.ndarray, "B N 3"]  # m/s
+    position: Float[np.ndarray, "3 N B"]  # m
+    velocity: Float[np.ndarray, "3 N B"]  # m/s
     health: Float[np.ndarray, "B N"]
-    terminal: Float[np.ndarray, "B 2 3"]  # m
-    hazard: Float[np.ndarray, "B 3"]  # m
-    apart: Float[np.ndarray, "B N+2 N+2"]  # m; nodes 0 and 1 are the terminals
+    terminal: Float[np.ndarray, "3 2 B"]  # m
+    hazard: Float[np.ndarray, "3 1 B"]  # m
+    apart: Float[np.ndarray, "N N B"]  # drone to drone, infinite to oneself, m
+    away: Float[np.ndarray, "2 N B"]  # terminal to drone, m
+    hops: Int8[np.ndarray, "2 N+2 B"]  # links from each terminal to each node; -1 where there is no way
 
 
 class HazardComm:
@@ -135,28 +137,36 @@ class HazardComm:
     def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
         """Positions do not lag behind the physics: they are generalised coordinates."""
         position, velocity = drones.kinematics(sim, self.spec.num_agents, rows)
-        marker = sim.marker[rows].copy()
-        nodes = np.concatenate([marker[:, :_HAZARD], position], axis=1)
+        marker = sim.marker[rows].T.copy()
+        terminal, health = marker[:, :_HAZARD], sim.field["health"][rows].copy()
+        apart, away = coverage.apart(position), coverage.distances(terminal, position)
         return Snapshot(
             position=position,
             velocity=velocity,
-            health=sim.field["health"][rows].copy(),
-            terminal=marker[:, :_HAZARD],
-            hazard=marker[:, _HAZARD],
-            apart=coverage.distances(nodes, nodes),
+            health=health,
+            terminal=terminal,
+            hazard=marker[:, _HAZARD:],
+            apart=apart,
+            away=away,
+            hops=self._hops(apart, away, health),
         )
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from the hazard."""
-        distance = np.linalg.norm(now.position - now.hazard[:, None], axis=-1)
+        (distance,) = coverage.distances(now.hazard, now.position)
         risk = hazards.risk(distance, self.params.hazard_radius, self.params.hazard_peak)
-        nobody = np.zeros_like(now.health, dtype=bool)
-        exposure = health.hazard_rate(risk, self.spec.control_step / 0.1)
-        return Harm(exposure, fatal=nobody, cause=nobody.astype(np.int64))
+        exposure = health.hazard_rate(risk, self.spec.control_step / 0.1).T.copy()
+        nobody = np.zeros(exposure.shape, bool)
+        return Harm(exposure, fatal=nobody, cause=np.zeros(exposure.shape, np.int64))
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
         """Count connected steps, when the first came, and how long the chains were."""
-        chain = radio.hops(self._links(now), _A, _B)
+        (bereft,) = (now.health != was.health).any(axis=1).nonzero()
+        if len(bereft):
+            now.hops[..., bereft] = self._hops(
+                now.apart[..., bereft], now.away[..., bereft], now.health[bereft]
+            )
+        chain = now.hops[_A, _B]
         connected = chain > 0
         field = sim.field
         first = connected & (field["connected"][:, 0] == 0)
@@ -167,7 +177,7 @@ class HazardComm:
 
     def reward(self, was: Snapshot, now: Snapshot) -> dict[str, Float[np.ndarray, "B"]]:
         """``connected``: 1 while a chain of live drones links the terminals."""
-        return {"connected": radio.reachable(self._links(now), _A)[:, _B].astype(np.float64)}
+        return {"connected": (now.hops[_A, _B] > 0).astype(np.float64)}
 
     def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], str]:
         """Never before the horizon."""
@@ -175,37 +185,35 @@ class HazardComm:
 
     def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """Own motion exactly, both terminals, own routes, nearby live drones and nearby wrecks."""
-        live = now.health > 0
-        radius = self.params.sensing_radius
-        apart = now.apart[:, 2:, 2:]  # without the terminals
-        wrecks = sensing.nearest_within(apart, ~live[:, None, :], radius, self._wrecks)
-        gap = sensing.gather(now.position, wrecks) - now.position[:, :, None]
-        return self.layout.observation.pack(
+        wrecks, neighbors = sensing.nearest_of_two_kinds(
+            now.apart, ~drones.living(now.health), self.params.sensing_radius, (self._wrecks, self._slots)
+        )
+        return drones.pack(
+            self.layout.observation,
             {
-                "health": now.health[..., None],
+                "health": now.health.T,
                 "velocity": now.velocity,
                 "position": now.position,
-                "terminal_position": now.terminal[:, None] - now.position[:, :, None],
-                "route": self._routes(now),
-                **drones.neighbors(
-                    apart, now.position, now.velocity, now.health, radius, self._slots, live_only=True
-                ),
+                "terminal_position": now.terminal.swapaxes(0, 1)[:, :, None] - now.position,
+                "route": now.hops[:, 2:] >= 0,
+                **drones.neighbors(neighbors, now.position, now.velocity, now.health),
                 "wreck_seen": wrecks.seen,
-                "wreck_position": np.where(wrecks.seen[..., None], gap, 0.0),
+                "wreck_position": drones.relative(now.position, wrecks.place, now.position),
             },
             now.health.shape,
         )
 
     def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
         """Everything, the hidden hazard included."""
-        return self.layout.state.pack(
+        return drones.pack(
+            self.layout.state,
             {
-                "health": now.health,
-                "position": now.position,
-                "velocity": now.velocity,
-                "route": self._routes(now),
-                "terminal_position": now.terminal,
-                "hazard_position": now.hazard,
+                "health": now.health.T,
+                "position": now.position.swapaxes(0, 1),
+                "velocity": now.velocity.swapaxes(0, 1),
+                "route": now.hops[:, 2:].swapaxes(0, 1) >= 0,
+                "terminal_position": now.terminal.swapaxes(0, 1),
+                "hazard_position": now.hazard[:, 0],
             },
             now.health.shape[:1],
         )
@@ -223,15 +231,16 @@ class HazardComm:
             "chain": np.where(ever, field["chain"][ids, 0] / np.maximum(linked, 1), np.nan),
         }
 
-    def _links(self, now: Snapshot) -> Bool[np.ndarray, "B M M"]:
-        """Who hears whom; the terminals never hear each other."""
-        count, terminals = len(now.health), np.ones((len(now.health), 2), bool)
-        links = coverage.contacts(
-            now.apart, np.concatenate([terminals, now.health > 0], axis=1), self.params.link_range
-        )
-        links[np.arange(count), _A, _B] = links[np.arange(count), _B, _A] = False
-        return links
-
-    def _routes(self, now: Snapshot) -> Bool[np.ndarray, "n N 2"]:
-        links = self._links(now)
-        return np.stack([radio.reachable(links, end)[:, 2:] for end in (_A, _B)], axis=-1)
+    def _hops(
+        self,
+        apart: Float[np.ndarray, "N N B"],
+        away: Float[np.ndarray, "2 N B"],
+        health: Float[np.ndarray, "B N"],
+    ) -> Int8[np.ndarray, "2 N+2 B"]:
+        """Links from each terminal to each node, over live drones; the terminals never hear each other."""
+        nodes, reach, live = len(apart) + 2, self.params.link_range, drones.living(health)
+        links = np.zeros((nodes, nodes, len(health)), bool)
+        links[2:, 2:] = (apart < reach) & live[:, None] & live
+        links[:2, 2:] = (away < reach) & live
+        links[2:, :2] = links[:2, 2:].swapaxes(0, 1)
+        return radio.hops(links, (_A, _B))

@@ -20,7 +20,8 @@ from hipg_bench.families import drones
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import coverage, hazards, health
+from hipg_bench.mechanics import coverage, hazards, health, sensing
+from hipg_bench.mechanics.pairs import few
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -48,18 +49,22 @@ class Params(drones.DroneParams):
     nobody: float = pydantic.Field(gt=0, le=20)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(kw_only=True)
 class Snapshot:
-    """The world at the end of a control step."""
+    """The world at the end of a control step; all but health has the worlds last."""
 
-    position: Float[np.ndarray, "B N 3"]  # m
-    velocity: Float[np.ndarray, "B N 3"]  # m/s
+    position: Float[np.ndarray, "3 N B"]  # m
+    velocity: Float[np.ndarray, "3 N B"]  # m/s
     health: Float[np.ndarray, "B N"]
-    point: Float[np.ndarray, "B P 3"]  # m
-    hazardous: Bool[np.ndarray, "B P"]
-    revealed: Bool[np.ndarray, "B P"]  # hazardous, and known to be
-    distance: Float[np.ndarray, "B P N"]  # point to drone, m
-    apart: Float[np.ndarray, "B N N"]  # drone to drone, m
+    point: Float[np.ndarray, "3 P B"]  # m
+    hazardous: Bool[np.ndarray, "P B"]
+    revealed: Bool[np.ndarray, "P B"]  # hazardous, and known to be
+    distance: Float[np.ndarray, "N P B"]  # drone to point, m
+    apart: Float[np.ndarray, "N N B"]  # drone to drone, infinite to oneself, m
+    exposed: tuple[Int[np.ndarray, "K"], ...]  # drone, point and world of each drone within a hazard
+    # once it is known who died
+    gap: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # point to live drone, mean over points, m
+    touching: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # pairs of live drones
 
 
 class HazardNav:
@@ -130,38 +135,47 @@ class HazardNav:
     def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
         """Positions do not lag behind the physics: they are generalised coordinates."""
         position, velocity = drones.kinematics(sim, self.spec.num_agents, rows)
-        point = sim.marker[rows].copy()
+        point = sim.marker[rows].T.copy()
+        hazardous = sim.field["hazardous"][rows].T > 0
+        distance = coverage.distances(position, point)
         return Snapshot(
             position=position,
             velocity=velocity,
             health=sim.field["health"][rows].copy(),
             point=point,
-            hazardous=sim.field["hazardous"][rows] > 0,
-            revealed=sim.field["revealed"][rows] > 0,
-            distance=coverage.distances(point, position),
-            apart=coverage.distances(position, position),
+            hazardous=hazardous,
+            revealed=sim.field["revealed"][rows].T > 0,
+            distance=distance,
+            apart=coverage.apart(position),
+            exposed=few((distance < self.params.hazard_radius) & hazardous),
         )
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from every hazard within reach."""
-        risk = hazards.risk(now.distance, self.params.hazard_radius, self.params.hazard_peak)
-        risk = np.where(now.hazardous[:, :, None], risk, 0.0)
-        exposure = health.hazard_rate(risk, self.spec.control_step / 0.1).sum(axis=1)
-        nobody = np.zeros_like(now.health, dtype=bool)
-        return Harm(exposure, fatal=nobody, cause=nobody.astype(np.int64))
+        exposure, nobody = np.zeros(now.health.shape), np.zeros(now.health.shape, bool)
+        drone, _, world = now.exposed
+        if len(world):
+            risk = hazards.risk(now.distance[now.exposed], self.params.hazard_radius, self.params.hazard_peak)
+            np.add.at(exposure, (world, drone), health.hazard_rate(risk, self.spec.control_step / 0.1))
+        return Harm(exposure, fatal=nobody, cause=np.zeros(exposure.shape, np.int64))
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
         """A hazard is revealed for good once a drone that was alive came within its radius."""
-        near = ((now.distance < self.params.hazard_radius) & (was.health > 0)[:, None, :]).any(axis=2)
-        revealed = was.revealed | (now.hazardous & near)
-        sim.field["revealed"][:] = revealed
-        sim.field["collisions"][:, 0] += self._collisions(now)
-        sim.field["covered"][:, 0] += self._gap(now).mean(axis=1)
-        return dataclasses.replace(now, revealed=revealed)
+        drone, point, world = now.exposed
+        alive = was.health[world, drone] > 0
+        now.revealed[point[alive], world[alive]] = True
+        live = drones.living(now.health)
+        # worlds first: else the order in which NumPy adds would depend on their number
+        now.gap = coverage.nearest(now.distance, live, self.params.nobody).T.copy().mean(axis=1)
+        now.touching = coverage.contacts(now.apart, live, 2 * self.params.drone_radius)
+        sim.field["revealed"][:] = now.revealed.T
+        sim.field["collisions"][:, 0] += now.touching
+        sim.field["covered"][:, 0] += now.gap
+        return now
 
     def reward(self, was: Snapshot, now: Snapshot) -> dict[str, Float[np.ndarray, "B"]]:
         """``distance``: mean over points to the nearest live drone, m; ``collision``: pairs that touch."""
-        return {"distance": self._gap(now).mean(axis=1), "collision": self._collisions(now)}
+        return {"distance": now.gap, "collision": now.touching}
 
     def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], str]:
         """Never: dying must not save a team from being charged."""
@@ -169,34 +183,34 @@ class HazardNav:
 
     def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """Own motion exactly, all points, and the nearest drones within the sensing radius."""
-        alive = now.health > 0
-        gap = now.point[:, None] - now.position[:, :, None]  # (n, N, P, 3)
-        order = np.argsort(now.distance.transpose(0, 2, 1), axis=-1, stable=True)
-        taken = self._taken(now, alive)
-        known = np.broadcast_to(now.revealed[:, None, :], order.shape)
-        return self.layout.observation.pack(
+        radius = self.params.sensing_radius
+        points = sensing.nearest(now.distance, self.spec.num_agents)
+        sensed = (now.apart <= radius) & drones.living(now.health)
+        taken = coverage.nearest_other(now.distance, sensed, radius)
+        neighbors = sensing.nearest_within(now.apart, radius, self._slots)
+        return drones.pack(
+            self.layout.observation,
             {
-                "health": now.health[..., None],
+                "health": now.health.T,
                 "velocity": now.velocity,
                 "position": now.position,
-                "point_position": np.take_along_axis(gap, order[..., None], axis=2),
-                "point_hazardous": np.take_along_axis(known, order, axis=2),
-                "point_gap": np.take_along_axis(taken, order, axis=2),
-                **drones.neighbors(
-                    now.apart, now.position, now.velocity, now.health, self.params.sensing_radius, self._slots
-                ),
+                "point_position": drones.relative(now.point, points, now.position),
+                "point_hazardous": sensing.look_up(now.revealed[None], points)[0],
+                "point_gap": sensing.look_up_own(taken, points),
+                **drones.neighbors(neighbors, now.position, now.velocity, now.health),
             },
             now.health.shape,
         )
 
     def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
         """Everything, the hidden hazards included."""
-        return self.layout.state.pack(
+        return drones.pack(
+            self.layout.state,
             {
-                "health": now.health,
-                "position": now.position,
-                "velocity": now.velocity,
-                "point_position": now.point,
+                "health": now.health.T,
+                "position": now.position.swapaxes(0, 1),
+                "velocity": now.velocity.swapaxes(0, 1),
+                "point_position": now.point.swapaxes(0, 1),
                 "point_hazardous": now.hazardous,
                 "point_revealed": now.revealed,
             },
@@ -212,17 +226,3 @@ class HazardNav:
             "collisions": sim.field["collisions"][ids, 0],
             "revealed": sim.field["revealed"][ids].sum(axis=1),
         }
-
-    def _gap(self, now: Snapshot) -> Float[np.ndarray, "B P"]:
-        return coverage.nearest(now.distance, now.health > 0, self.params.nobody)
-
-    def _collisions(self, now: Snapshot) -> Float[np.ndarray, "B"]:
-        """Touching pairs of live drones."""
-        return coverage.contacts(now.apart, now.health > 0, 2 * self.params.drone_radius).sum(axis=(1, 2)) / 2
-
-    def _taken(self, now: Snapshot, alive: Bool[np.ndarray, "n N"]) -> Float[np.ndarray, "n N P"]:
-        """Distance from each point to the nearest other live drone that drone i senses, capped."""
-        radius = self.params.sensing_radius
-        sensed = (now.apart <= radius) & alive[:, None, :] & ~np.eye(alive.shape[1], dtype=bool)
-        reach = np.where(sensed[:, :, None, :], now.distance[:, None], radius)  # (n, N, P, N)
-        return np.minimum(reach.min(axis=-1), radius)

@@ -18,5 +18,4 @@ def risk(distance: Float[np.ndarray, "..."], radius: float, peak: float) -> Floa
         peak: the chance at the centre, in [0, 1).
     """
     xp = array_namespace(distance)
-    inside = 1.0 - (distance / radius) ** 2
-    return peak * xp.where(inside > 0, inside, xp.zeros_like(inside))
+    return peak * xp.maximum(1.0 - (distance / radius) ** 2, 0.0)

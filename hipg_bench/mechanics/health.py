@@ -52,6 +52,6 @@ def damage(
     xp = array_namespace(health)
     exposure = xp.where(health > 0, exposure + gained, exposure)
     left = 1.0 - exposure / toughness
-    whole = xp.where(left > 0, left if graded else xp.ones_like(left), xp.zeros_like(left))
-    after = xp.where(fatal, xp.zeros_like(left), whole)
-    return xp.where(after < health, after, health), exposure
+    lives = (left > 0) & ~fatal
+    after = xp.where(lives, left, 0.0) if graded else xp.astype(lives, left.dtype)
+    return xp.minimum(after, health), exposure
