@@ -36,7 +36,7 @@ RUNS = (
     Run("custom_task.py"),
     Run("cleanrl_ppo.py", "--iterations 12", gain=2.0),
     Run("sb3_ppo.py", "--iterations 12", "stable_baselines3", gain=2.0),
-    Run("torchrl_mappo.py", "--iterations 3", "torchrl"),
+    Run("torchrl_mappo.py", "--iterations 12", "torchrl", gain=3.0),
     Run("rllib_ppo.py", "--iterations 2 --steps 500", "ray"),
     Run("benchmarl_maddpg.py", "--frames 2000", "benchmarl"),
     Run("benchmarl_qmix.py", "--frames 2000", "benchmarl"),

@@ -16,8 +16,9 @@ import numpy as np
 from dm_env import specs
 
 from hipg_bench.adapters import death
+from hipg_bench.adapters.joint import split_action
+from hipg_bench.adapters.named import gather, numbered
 from hipg_bench.env import Step
-from hipg_bench.errors import ActionError
 from hipg_bench.registry import make, tasks
 from hipg_bench.spec import TaskSpec
 
@@ -69,6 +70,7 @@ class HipgEnvironment(dm_env.Environment):
         self._env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
         self.spec, self._joint = self._env.spec, joint
         self._alive, self._over = np.ones((1, self.spec.num_agents), bool), True
+        self._number = numbered(self.spec)
         self._mirror: Mirror | None = None
 
     def reset(self) -> dm_env.TimeStep:
@@ -82,21 +84,16 @@ class HipgEnvironment(dm_env.Environment):
 
         Raises:
             ActionError: wrong shape, or a value for a live agent that is not finite.
+            UnknownNameError: more actions than agents.
         """
         if self._over:
             return self.reset()
-        count, size = self.spec.num_agents, self._env.action_size
-        parts = np.array_split(np.asarray(action), count) if self._joint else action
-        if len(parts) != count:
-            raise ActionError(f"{self.spec.task}: one action for each of {count} agents, got {len(parts)}")
-        for agent, part in enumerate(parts):
-            if np.shape(part) != (size,):
-                got = f"got {np.shape(part)} for agent {agent}"
-                raise ActionError(f"{self.spec.task}: actions of shape {(size,)} are allowed, {got}")
-        step = self._env.step(np.stack(parts)[None])
         if self._joint:
+            step = self._env.step(split_action(self._env, action, ()))
             reward, (terminated,), (truncated,) = float(step.reward[0]), step.terminated, step.truncated
         else:
+            told = {f"agent_{i}": part for i, part in enumerate(action)}
+            step = self._env.step(gather(self._env, self._number, told, self._alive[0].tolist()))
             reward = death.pay(self.spec, step, self._alive)[0].tolist()
             (terminated,), (truncated,) = death.ends(self.spec, step)
         self._alive, self._over = step.info["alive"], bool(terminated or truncated)
