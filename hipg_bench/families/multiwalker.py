@@ -68,6 +68,7 @@ class Snapshot:
     health: Float[np.ndarray, "B N"]
     down: Float[np.ndarray, "B N"]  # control steps in a row tipped or sunk
     plank_low: Float[np.ndarray, "B"]  # height of the plank's lowest corner, m
+    felt: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None = None  # own bodies and the plank
 
     @functools.cached_property
     def touch(self) -> Bool[np.ndarray, "B N 2"]:
@@ -94,7 +95,10 @@ class MultiWalker:
         self._servos = 2 * int(body.servo.sum())
         self._corners = walker_body.plank_corners(n, params.spacing, params.overhang)
         # in the plane, vectors have x and z only, and turning has y only
-        self._axes, self._turns = ([0, 2], [1]) if params.planar else ([0, 1, 2], [0, 1, 2])
+        self._axes, self._turns = (slice(0, 3, 2), slice(1, 2)) if params.planar else (slice(3), slice(3))
+        self._dims, self._spins = (2, 1) if params.planar else (3, 3)
+        # the plank's long axis points up by the pitch, aside by the yaw; its side axis points up by the roll
+        self._lie = ([2], [0]) if params.planar else ([2, 2, 1], [0, 1, 0])
         self.layout = TaskLayout(self._observation(), self._action(), self._state())
 
     def scene(self) -> mujoco.MjSpec:
@@ -130,7 +134,7 @@ class MultiWalker:
         """Whoever is tipped or sunk for long enough has fallen."""
         tipped, _ = self._off_feet(now)
         fatal = self._down(was, now) >= self.params.fall_steps
-        return Harm(np.zeros_like(now.health), fatal, cause=np.where(tipped, 0, 1))
+        return Harm(np.zeros(fatal.shape), fatal, cause=np.where(tipped, 0, 1))
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
         """Count the steps off one's feet, the plank's way, and how far it left its live carriers behind."""
@@ -171,8 +175,8 @@ class MultiWalker:
 
     def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """Own body exactly, the plank above one's head, and the neighbours before and behind."""
-        pose, own = now.pose, self._proprioception(now)
-        plank = self._plank(now)
+        pose = now.pose
+        own, plank = self._felt(now)
         head = pose.position[:, :-1] + self.body.head_top * pose.rotation[:, :-1, :, 2]
         seat = (head - pose.position[:, -1:]) @ pose.rotation[:, -1]  # into the plank's frame
         seat[..., 0] -= self._seats
@@ -189,15 +193,16 @@ class MultiWalker:
     def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
         """All bodies, and how long each walker has been off its feet."""
         pose = now.pose
+        own, plank = self._felt(now)
         place = pose.position[:, :-1] - pose.position[:, -1:]
         place[..., 0] -= self._seats
         parts = {
             "health": now.health,
             "down": now.down,
             "place": place[..., self._axes],
-            **self._proprioception(now),
+            **own,
             "plank_position": pose.position[:, -1, self._axes],
-            **self._plank(now),
+            **plank,
         }
         return self.layout.state.pack(parts, now.health.shape[:1])
 
@@ -233,6 +238,12 @@ class MultiWalker:
     def _fallen(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
         return (now.health == 0).all(axis=1)
 
+    def _felt(self, now: Snapshot) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Own bodies and the plank, as observations and joint states have them alike."""
+        if now.felt is None:
+            now.felt = self._proprioception(now), self._plank(now)
+        return now.felt
+
     def _proprioception(self, now: Snapshot) -> dict[str, np.ndarray]:
         """What each walker feels of its own body; the blocks of `_proprioception_blocks`."""
         pose = now.pose
@@ -256,27 +267,23 @@ class MultiWalker:
     def _plank(self, now: Snapshot) -> dict[str, np.ndarray]:
         """How the plank lies and moves; the blocks of `_plank_blocks`."""
         rotation, velocity = now.pose.rotation[:, -1], now.pose.velocity[:, -1]
-        # its long axis points up by the pitch and aside by the yaw; its side axis points up by the roll
-        lie = np.stack([rotation[:, 2, 0], rotation[:, 2, 1], rotation[:, 1, 0]], axis=-1)
         return {
-            "plank_lie": lie[:, : len(self._turns)],
+            "plank_lie": rotation[:, *self._lie],
             "plank_velocity": velocity[:, self._axes],
             "plank_spin": now.pose.spin[:, -1, self._turns],
         }
 
     def _neighbors(self, now: Snapshot) -> dict[str, np.ndarray]:
         """The walkers behind and before each one: gap beyond the seats' spacing, and relative velocity."""
-        count, n = now.health.shape
-        there, health = np.zeros((n, 2)), np.zeros((count, n, 2))
-        gap, speed = np.zeros((2, count, n, 2, 3))
-        # the one behind, and the one ahead
-        for side, own, other in ((0, slice(1, n), slice(0, n - 1)), (1, slice(0, n - 1), slice(1, n))):
-            there[own, side] = 1
-            health[:, own, side] = now.health[:, other]
-            gap[:, own, side] = now.pose.position[:, other] - now.pose.position[:, own]
-            speed[:, own, side] = now.pose.velocity[:, other] - now.pose.velocity[:, own]
-        gap[:, 1:, 0, 0] += self.params.spacing
-        gap[:, :-1, 1, 0] -= self.params.spacing
+        there = np.ones((*now.health.shape, 2))
+        there[:, 0, 0] = there[:, -1, 1] = 0
+        health = np.zeros_like(there)
+        health[:, 1:, 0], health[:, :-1, 1] = now.health[:, :-1], now.health[:, 1:]
+        gap, speed = np.zeros((2, *there.shape, 3))
+        way, lead = (of[:, 1:-1] - of[:, :-2] for of in (now.pose.position, now.pose.velocity))
+        way[..., 0] -= self.params.spacing
+        gap[:, 1:, 0], gap[:, :-1, 1] = -way, way
+        speed[:, 1:, 0], speed[:, :-1, 1] = -lead, lead
         return {
             "neighbor_there": there,
             "neighbor_health": health,
@@ -285,7 +292,7 @@ class MultiWalker:
         }
 
     def _observation(self) -> Layout:
-        d, there = len(self._axes), "where there is one, dead or alive"
+        d, there = self._dims, "where there is one, dead or alive"
         return Layout((
             Block("health", (1,), "1"),
             Block("height", (1,), "m", "world"),
@@ -306,7 +313,7 @@ class MultiWalker:
         )
 
     def _state(self) -> Layout:
-        n, d = self.spec.num_agents, len(self._axes)
+        n, d = self.spec.num_agents, self._dims
         return Layout((
             Block("health", (n,), "1"),
             Block("down", (n,), "control steps off one's feet"),
@@ -317,7 +324,7 @@ class MultiWalker:
         ))  # fmt: skip
 
     def _proprioception_blocks(self, lead: tuple[int, ...]) -> tuple[Block, ...]:
-        d, turns, joints = len(self._axes), len(self._turns), self.body.joints
+        d, turns, joints = self._dims, self._spins, self.body.joints
         heading = (
             () if self.params.planar else (Block("heading", (*lead, 3), "1", "world's x axis in the body's"),)
         )
@@ -333,7 +340,7 @@ class MultiWalker:
         )
 
     def _plank_blocks(self) -> tuple[Block, ...]:
-        d, turns = len(self._axes), len(self._turns)
+        d, turns = self._dims, self._spins
         return (
             Block("plank_lie", (turns,), "1", "sines of pitch, roll and yaw"),
             Block("plank_velocity", (d,), "m/s", "world"),

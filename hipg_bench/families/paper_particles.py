@@ -116,7 +116,9 @@ class Particles(abc.ABC, Generic[S]):
         """Exposure from hazards, and from every contact of the living."""
         alive = was.health > 0
         burn, crash = self._burn(now), self._crash(now, alive)
-        return Harm(burn + crash, np.zeros_like(alive), cause=np.where(crash > burn, _COLLISION, _HAZARD))
+        return Harm(
+            burn + crash, np.zeros(alive.shape, bool), cause=np.where(crash > burn, _COLLISION, _HAZARD)
+        )
 
     def terminated(self, now: S) -> tuple[Bool[np.ndarray, "B"], str]:
         """Never: the dead stay, and so does the horizon."""
@@ -212,7 +214,7 @@ class Particles(abc.ABC, Generic[S]):
         """Exposure of each agent from the hazards it is in, nats."""
         world, agent, point = now.exposed
         if not len(world):
-            return np.zeros_like(now.health)
+            return np.zeros(now.health.shape)
         law = self._law
         risk = hazards.risk(now.gaps.away[point, agent, world], law.hazard_radius, law.hazard_peak)
         rate = health_law.hazard_rate(risk, self.spec.control_step / 0.1)
@@ -224,7 +226,7 @@ class Particles(abc.ABC, Generic[S]):
         both, _ = self._overlaps(now, alive)
         whom = np.concatenate([now.contacts.one[both], now.contacts.other[both]])
         if not (self._law.collision_risk and len(whom)):
-            return np.zeros_like(now.health)
+            return np.zeros(now.health.shape)
         rate = np.full(len(whom), -np.log1p(-self._law.collision_risk))
         return np.bincount(whom, rate, alive.size).reshape(alive.shape)
 

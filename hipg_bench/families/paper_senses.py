@@ -97,7 +97,7 @@ def _count(
         counted[: len(mirrored)] &= one & other
     if shown is not None and not shown.all():
         counted[len(mirrored) :] &= np.repeat(shown.T, agents, axis=0)
-    seen = np.flatnonzero(counted)
+    (seen,) = counted.ravel().nonzero()
     x, y, distance = (part[: len(origin)].ravel().take(seen) for part in (*gaps.gap, gaps.distance))
     cell = histogram.cells(x, y, distance)
     flat, one_more = look.reshape(-1, copy=False), np.float32(1)

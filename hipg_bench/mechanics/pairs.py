@@ -115,7 +115,7 @@ def linked(
 
 def few(holds: Bool[np.ndarray, "*axes"]) -> tuple[Int[np.ndarray, "n"], ...]:
     """`np.nonzero`, several times faster where few entries of several axes hold."""
-    return np.unravel_index(np.flatnonzero(holds), holds.shape)
+    return np.unravel_index(holds.ravel().nonzero()[0], holds.shape)
 
 
 def repulsion(
@@ -134,7 +134,7 @@ def repulsion(
         margin: depth over which the contact sets in, m.
     """
     holds = solid.ravel()
-    push = np.flatnonzero(holds[contact.one] & holds[contact.other] & (contact.distance > 0))
+    (push,) = (holds[contact.one] & holds[contact.other] & (contact.distance > 0)).nonzero()
     if not len(push):
         return np.zeros((*solid.shape, 2))
     distance = contact.distance[push]
