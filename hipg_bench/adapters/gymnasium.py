@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 
 from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action
 from hipg_bench.env import Step
+from hipg_bench.errors import RenderError
 from hipg_bench.registry import make
 from hipg_bench.rendering.live import Live
 from hipg_bench.spec import TaskSpec
@@ -42,6 +43,11 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._env = env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
         self.task_spec, self.render_mode = env.spec, render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / env.spec.control_step)}
+        if render_mode not in (None, "rgb_array"):
+            raise RenderError(
+                f"{env.spec.task}: the render mode 'rgb_array' is allowed, got {render_mode!r}; "
+                f"`gymnasium.make(..., render_mode='human')` shows its pictures in a window"
+            )
         self._live = Live(env.spec, render_mode) if render_mode else None
         self.observation_space, self.action_space = joint_spaces(env)
 
@@ -72,7 +78,7 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """The world as it is.
 
         Raises:
-            RenderError: no OpenGL works here.
+            RenderError: no episode has begun, or no OpenGL works here.
         """
         return self._live.picture() if self._live else None
 

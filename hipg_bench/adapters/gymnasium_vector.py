@@ -26,6 +26,9 @@ Returned = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """B worlds of a task; ``task_spec`` holds the task's numbers."""
 
+    # until it is built: Gymnasium before 1.4 closes also what could not be
+    closed = True
+
     def __init__(
         self,
         task: str | TaskSpec,
@@ -57,6 +60,7 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.empty(0, np.int64)
+        self.closed = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -128,9 +128,8 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
         """The world as it is, with ``rgb_array``; a window shows it by itself.
 
         Raises:
-            RenderError: no OpenGL works here.
+            RenderError: no episode has begun, or no OpenGL works here.
         """
-        self._seen()
         return self._live.picture() if self._live and self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

@@ -66,25 +66,28 @@ class Live:
         self._job = Job(spec=spec, mode=mode)
         self._unseen: list[Float[np.ndarray, "R"]] = []
         self._child: _Child | None = None
-        self._shut = False
+        self._shows = False
 
     def begin(self, row: Float[np.ndarray, "R"]) -> None:
         """An episode starts: forget what nobody asked to see of the last one."""
         self._unseen.clear()
+        self._shows = True
         self.see(row)
 
     def see(self, row: Float[np.ndarray, "R"]) -> None:
         """The world after a control step; a window shows it, at the pace of the world, until it is closed."""
         self._unseen.append(row)
-        if self._job.mode == "human" and not self._shut:
-            self._shut = not self._ask(1)
+        if self._job.mode == "human" and self._shows:
+            self._shows = bool(self._ask(1))
 
     def picture(self) -> UInt8[np.ndarray, "height width 3"]:
         """The world as it was last seen.
 
         Raises:
-            RenderError: no OpenGL works here, or the child failed.
+            RenderError: no episode has begun, no OpenGL works here, or the child failed.
         """
+        if not self._shows:
+            raise RenderError(f"{self._job.spec.task}: nothing to render before reset() and after close()")
         width, height = SIZE
         return np.frombuffer(self._ask(width * height * 3), np.uint8).reshape(height, width, 3).copy()
 
@@ -92,7 +95,7 @@ class Live:
         """End the child."""
         if self._child:
             self._child.end()
-        self._child, self._shut = None, True
+        self._child, self._shows = None, False
 
     def _ask(self, size: int) -> bytes:
         """Send the rows that the child has not seen; its answer, empty where its window was closed."""

@@ -10,7 +10,7 @@ import hipg_bench
 import hipg_bench.gym
 from hipg_bench.adapters.gymnasium import HipgEnv
 from hipg_bench.adapters.gymnasium_vector import HipgVectorEnv
-from hipg_bench.errors import ActionError, HipgError, SpecError, UnknownNameError
+from hipg_bench.errors import ActionError, HipgError, RenderError, SpecError, UnknownNameError
 
 TASK = "hazard_nav-4"
 SWIFT = {"hazard_peak": 0.9, "hazard_radius": 3.0}
@@ -92,8 +92,6 @@ def test_a_step_before_the_first_reset(dead):
         env.step(zeros(env))
     with refused(HipgError, "hazard_nav-4: reset() comes first"):
         env.state()
-    with refused(HipgError, "hazard_nav-4: reset() comes first"):
-        env.render()
 
 
 @modes
@@ -144,6 +142,17 @@ def test_unknown_names_are_met_with_the_nearest():
         hipg_bench.parallel_env(TASK, horizn=3)
     with refused(SpecError, "hazard_nav-4: reward_dead = 'some' is refused"):
         hipg_bench.parallel_env(TASK, reward_dead="some")
+
+
+@pytest.mark.parametrize("face", [hipg_bench.parallel_env, HipgEnv])
+def test_a_picture_before_the_first_reset_or_after_close(face):
+    env = face(TASK, render_mode="rgb_array")
+    with refused(RenderError, "hazard_nav-4: nothing to render before reset() and after close()"):
+        env.render()
+    env.reset()
+    env.close()
+    with refused(RenderError, "hazard_nav-4: nothing to render before reset() and after close()"):
+        env.render()
 
 
 # Gymnasium
@@ -200,3 +209,5 @@ def test_unknown_names_are_met_with_the_nearest_here_too():
         gymnasium.make(f"hipg/{TASK}-v1", horizn=3)
     with refused(SpecError, "no field 'horizn'; did you mean 'horizon'?"):
         gymnasium.make_vec(f"hipg/{TASK}-v1", 2, horizn=3)
+    with refused(RenderError, "hazard_nav-4: the render mode 'rgb_array' is allowed, got 'human'"):
+        HipgEnv(TASK, render_mode="human")
