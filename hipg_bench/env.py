@@ -135,7 +135,8 @@ class BatchEnv:
             )
         if seed is not None:
             self._seed, self._next_episode = seed, 0
-        self._begin(ids, episodes)
+        if len(ids):
+            self._begin(ids, episodes)
         return self._resume(ids)
 
     def step(self, action: Float[np.ndarray, "B N A"]) -> Step:

@@ -257,6 +257,7 @@ def test_a_reset_in_mid_episode_leaves_the_other_worlds_alone(env: BatchEnv):
     middle = play(env, env.reset(np.arange(4)), 3)[-1]
     rows = env.rows
     step = env.reset(np.array([9]), worlds=np.array([2]))
+    assert same(env.reset(worlds=np.empty(0, np.int64)).observation, step.observation), "no world, no change"
     others = np.array([0, 1, 3])
     assert same(step.observation[others], middle.observation[others])
     assert same(env.rows[others], rows[others])
