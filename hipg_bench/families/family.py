@@ -80,6 +80,10 @@ class Family(Protocol):
         """Snapshot of worlds ``rows``."""
         ...
 
+    def renew(self, sim: Sim, now: Any, ids: Int[np.ndarray, "n"], fresh: Any) -> Any:
+        """Snapshot of all worlds, of which ``ids`` have just begun anew, as their snapshot ``fresh`` says."""
+        ...
+
     def harm(self, was: Any, now: Any) -> Harm:
         """What this step does to the agents."""
         ...

@@ -151,6 +151,10 @@ class HazardComm:
             hops=self._hops(apart, away, health),
         )
 
+    def renew(self, sim: Sim, now: Snapshot, ids: Int[np.ndarray, "n"], fresh: Snapshot) -> Snapshot:
+        """Episodes end at the horizon, so that all worlds usually do so together."""
+        return self.read(sim)
+
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from the hazard."""
         (distance,) = coverage.distances(now.hazard, now.position)

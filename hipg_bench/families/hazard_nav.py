@@ -150,6 +150,10 @@ class HazardNav:
             exposed=few((distance < self.params.hazard_radius) & hazardous),
         )
 
+    def renew(self, sim: Sim, now: Snapshot, ids: Int[np.ndarray, "n"], fresh: Snapshot) -> Snapshot:
+        """Episodes end at the horizon, so that all worlds usually do so together."""
+        return self.read(sim)
+
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from every hazard within reach."""
         exposure, nobody = np.zeros(now.health.shape), np.zeros(now.health.shape, bool)

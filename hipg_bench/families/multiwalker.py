@@ -130,6 +130,15 @@ class MultiWalker:
             plank_low=pose.position[:, -1, 2] + (x + y + z).min(axis=1),
         )
 
+    def renew(self, sim: Sim, now: Snapshot, ids: Int[np.ndarray, "n"], fresh: Snapshot) -> Snapshot:
+        """Walkers fall at all times: in most steps a few worlds of many begin anew."""
+        for whole, part in ((now, fresh), (now.pose, fresh.pose)):
+            for name, array in vars(part).items():
+                if isinstance(array, np.ndarray):
+                    vars(whole)[name][ids] = array
+        now.felt = None
+        return now
+
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Whoever is tipped or sunk for long enough has fallen."""
         tipped, _ = self._off_feet(now)
@@ -178,7 +187,8 @@ class MultiWalker:
         pose = now.pose
         own, plank = self._felt(now)
         head = pose.position[:, :-1] + self.body.head_top * pose.rotation[:, :-1, :, 2]
-        seat = (head - pose.position[:, -1:]) @ pose.rotation[:, -1]  # into the plank's frame
+        # into the plank's frame
+        seat = np.einsum("...ni,...ij->...nj", head - pose.position[:, -1:], pose.rotation[:, -1])
         seat[..., 0] -= self._seats
         parts = {
             "health": now.health[..., None],

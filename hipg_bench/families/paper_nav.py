@@ -201,7 +201,7 @@ class PaperNav(particles.Particles[Snapshot]):
     def _nearest_revealed(self, now: Snapshot) -> Float[np.ndarray, "n N 2"]:
         """Relative position of the nearest revealed hazard, m; zeros before one is known."""
         found = np.zeros(now.position.shape)
-        (ids,) = now.revealed.any(axis=1).nonzero()
+        (ids,) = np.nonzero(now.revealed.any(axis=1))
         if len(ids):
             distance = np.where(now.revealed[ids].T[:, None], now.gaps.away[..., ids], np.inf)
             found[ids] = now.point[ids[:, None], distance.argmin(axis=0).T] - now.position[ids]

@@ -18,7 +18,7 @@ import numpy as np
 import pydantic
 from jaxtyping import Bool, Float, Float32, Int
 
-from hipg_bench.families.family import Harm, Rows
+from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker, asset, attach
 from hipg_bench.layout import Block, Layout, TaskLayout
 from hipg_bench.mechanics import hazards, pairs
@@ -112,6 +112,10 @@ class Particles(abc.ABC, Generic[S]):
         )
         sim.applied[:] = self._factor * push.reshape(len(action), -1)
 
+    def renew(self, sim: Sim, now: S, ids: Int[np.ndarray, "n"], fresh: S) -> S:
+        """Episodes end at the horizon, so that all worlds usually do so together."""
+        return self.read(sim)
+
     def harm(self, was: S, now: S) -> Harm:
         """Exposure from hazards, and from every contact of the living."""
         alive = was.health > 0
@@ -132,6 +136,10 @@ class Particles(abc.ABC, Generic[S]):
         half = now_and_then.shape[-1] // 2
         now_and_then[..., :half], now_and_then[..., half:] = self._look(now), self._look_back(now)
         return now_and_then
+
+    @abc.abstractmethod
+    def read(self, sim: Sim, rows: Rows = EVERY) -> S:
+        """Positions do not lag behind the physics: they are generalised coordinates."""
 
     @abc.abstractmethod
     def _list(self, now: S) -> Float[np.ndarray, "n N O"]:

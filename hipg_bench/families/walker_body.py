@@ -230,12 +230,12 @@ def pose(body: Body, sim: Sim, rows: Rows = EVERY) -> Pose:
     rate, joint_rate = _parts(sim.velocity[rows], body.root_v, body.joints)
     legs = joint.transpose(3, 0, 1, 2), joint_rate.transpose(3, 0, 1, 2)
     if not body.planar:
-        position, quaternion, velocity, spin = root[:3], root[3:], rate[:3], rate[3:]
+        position, rotation, velocity, spin = root[:3], _matrix(root[3:]), rate[:3], rate[3:]
     else:
-        zero, half = np.zeros_like(root[0]), root[2] / 2
-        position, velocity = np.stack([root[0], zero, root[1]]), np.stack([rate[0], zero, rate[1]])
-        quaternion, spin = np.stack([np.cos(half), zero, np.sin(half), zero]), np.stack([zero, rate[2], zero])
-    vectors = (position.T, _matrix(quaternion).transpose(3, 2, 0, 1), velocity.T, spin.T)
+        position, velocity, spin = (np.zeros(root.shape) for _ in range(3))
+        position[::2], velocity[::2], spin[1] = root[:2], rate[:2], rate[2]
+        rotation = _pitched(root[2])
+    vectors = (position.T, rotation.transpose(3, 2, 0, 1), velocity.T, spin.T)
     return Pose(*vectors, *legs)
 
 
@@ -259,6 +259,15 @@ def _matrix(quaternion: Float[np.ndarray, "4 *lead"]) -> Float[np.ndarray, "3 3 
         xz - wy, yz + wx, 1 - (xx + yy),
     ]  # fmt: skip
     return np.concatenate(matrix).reshape(3, 3, *unit.shape[1:])
+
+
+def _pitched(angle: Float[np.ndarray, "*lead"]) -> Float[np.ndarray, "3 3 *lead"]:
+    """Rotation matrices of turns about the y axis."""
+    matrix = np.zeros((3, 3, *angle.shape))
+    matrix[0, 0] = matrix[2, 2] = np.cos(angle)
+    matrix[0, 2], matrix[1, 1] = np.sin(angle), 1
+    matrix[2, 0] = -matrix[0, 2]
+    return matrix
 
 
 def sole_height(

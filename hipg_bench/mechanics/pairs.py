@@ -134,7 +134,7 @@ def repulsion(
         margin: depth over which the contact sets in, m.
     """
     holds = solid.ravel()
-    (push,) = (holds[contact.one] & holds[contact.other] & (contact.distance > 0)).nonzero()
+    (push,) = np.nonzero(holds[contact.one] & holds[contact.other] & (contact.distance > 0))
     if not len(push):
         return np.zeros((*solid.shape, 2))
     distance = contact.distance[push]
