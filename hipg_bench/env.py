@@ -201,7 +201,7 @@ class BatchEnv:
             self._begin(ended, self._next_episode + np.arange(len(ended)))
             fresh = family.read(sim, ended)
             observation[ended], state[ended] = self._perceive(fresh)
-            self._now = fresh if len(ended) == self.num_envs else family.read(sim)
+            self._now = fresh if len(ended) == self.num_envs else family.renew(sim, now, ended, fresh)
         else:
             self._now, self._waiting = now, done
         return Step(observation, reward, terminated, truncated, info | self._present(state))
