@@ -286,7 +286,7 @@ def sole_height(
         thigh, shin = joint[..., 0], joint[..., 0] - joint[..., 1]
     else:
         # outwards is a turn about +x for the left leg, about -x for the right one
-        turn = joint[..., 0] * np.array([1.0, -1.0])
+        turn = joint[..., 0] * np.array([1, -1], joint.dtype)
         cosine, sine = np.cos(turn), np.sin(turn)
         y, z = y * cosine + z * sine, z * cosine - y * sine
         thigh, shin = joint[..., 1], joint[..., 1] - joint[..., 2]
