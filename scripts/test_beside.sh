@@ -2,8 +2,8 @@
 # Tests the face of a library that cannot share an environment with the others, in .venv-<name>, which is made
 # on the first run (a few minutes). What follows the name goes to pytest.
 #
-#   scripts/test_beside.sh rllib         ray pins gymnasium
-#   scripts/test_beside.sh benchmarl     it pins an older TorchRL, whose face is tested with it
+#   scripts/test_beside.sh rllib         ray pins gymnasium 1.2: our oldest, so its faces are tested here too
+#   scripts/test_beside.sh benchmarl     it pins TorchRL 0.11, whose face is tested here too
 #   PYTHON=python3.12 scripts/...        use this Python instead of that of .venv, or the newest one found
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -12,8 +12,8 @@ say() { printf 'test_beside: %s\n' "$*" >&2; }
 
 name=${1:-}
 case $name in
-    rllib) library='ray[rllib]' faces=rllib files=() ;;
-    benchmarl) library=benchmarl faces='benchmarl or torchrl' files=(tests/adapters/test_face_torchrl.py) ;;
+    rllib) library='ray[rllib]' other=gymnasium ;;
+    benchmarl) library=benchmarl other=torchrl ;;
     *) say "rllib or benchmarl, got '$name'" && exit 2 ;;
 esac
 shift
@@ -46,4 +46,4 @@ if [ ! "$venv/.ready" -nt "$pins" ] || [ ! "$venv/.ready" -nt pyproject.toml ]; 
 fi
 
 exec "$venv/bin/python" -m pytest tests/adapters/test_truth_table.py tests/adapters/test_agreement.py \
-    "tests/adapters/test_face_$name.py" "${files[@]}" -k "$faces" "$@"
+    "tests/adapters/test_face_$name.py" "tests/adapters/test_face_$other.py" -k "$name or $other" "$@"

@@ -11,9 +11,11 @@ average rewards over the team, so the dead share the team's: else a team would b
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import torch
+import yaml
 from benchmarl.environments.common import Task, TaskClass
 from tensordict import TensorDictBase
 from torchrl.data import Categorical, Composite, TensorSpec
@@ -162,7 +164,7 @@ class _HipgTasks(Task):
 
     def get_from_yaml(self, path: str | None = None) -> TaskClass:
         """The task, with a config read from a YAML file, by default with the numbers of its file."""
-        return super().get_from_yaml(path) if path else self.get_task()
+        return self.get_task(yaml.safe_load(Path(path).read_text("utf-8")) if path else None)
 
 
 HipgTask = _HipgTasks("HipgTask", dict.fromkeys(_TASKS), module=__name__)

@@ -174,6 +174,7 @@ def test_discrete_choices_are_rest_and_pushes_along_one_axis():
         np.testing.assert_array_equal(shown["agents", "observation"], step.observation)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("continuous", [True, False])
 @pytest.mark.parametrize("task", HipgTask)
 def test_torchrl_is_content_with_every_task(task, continuous):

@@ -52,11 +52,13 @@ def still(env, agents=None):
     return {agent: np.zeros(env.action_spaces[agent].shape) for agent in agents or env.possible_agents}
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("task", hipg_bench.tasks())
 def test_rllibs_own_check_is_content_with_every_task(task):
     check_multiagent_environments(HipgMultiAgentEnv({"task": task}))
 
 
+@pytest.mark.filterwarnings("error")
 def test_rllibs_own_check_is_content_where_agents_die_at_once():
     env = HipgMultiAgentEnv({"task": "hazard_nav-8", **SWIFT})
     check_multiagent_environments(env)
