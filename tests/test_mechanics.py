@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csgraph
 from scipy.spatial import distance as scipy_distance
@@ -86,8 +86,13 @@ def test_nearest_by_a_plain_loop(seed: int, agents: int, nobody: float):
             assert ours[p, b] == best
 
 
-@given(SEEDS, st.integers(1, 6), st.floats(0.05, 3))
-def test_nearest_other_by_a_plain_loop(seed: int, agents: int, cap: float):
+@pytest.mark.parametrize("cache", [1, 40, coverage._CACHE])
+@given(seed=SEEDS, agents=st.integers(1, 6), cap=st.floats(0.05, 3))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_nearest_other_by_a_plain_loop(
+    seed: int, agents: int, cap: float, cache: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(coverage, "_CACHE", cache)
     rng = np.random.default_rng(seed)
     distance, counts = rng.uniform(0, 2, (agents, 5, 4)), rng.random((agents, agents, 4)) < 0.6
     ours = coverage.nearest_other(distance, counts, cap)

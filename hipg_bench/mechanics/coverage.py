@@ -11,6 +11,9 @@ from jaxtyping import Bool, Float, Float32
 
 from hipg_bench.mechanics.pairs import few, members
 
+_CACHE = 1 << 18
+"""Numbers of four bytes that a core's own cache holds, about."""
+
 
 def distances(a: Float[np.ndarray, "D P B"], b: Float[np.ndarray, "D Q B"]) -> Float[np.ndarray, "P Q B"]:
     """Euclidean distance between every point of ``a`` and every point of ``b``."""
@@ -52,9 +55,15 @@ def nearest_other(
         counts: whether the agent of the first axis knows of the one of the second.
         cap: the most that is ever returned, also when none is known, m.
     """
-    # at once in the precision of observations: rounding keeps the order, so the nearest stays the same
+    # in the precision of observations from the start: rounding keeps the order, so the nearest stays the same
     reach, barrier = distance.astype(np.float32), ~counts * np.float32(cap)
-    return np.minimum.reduce(np.maximum(reach, barrier[:, :, None]), axis=1, initial=np.float32(cap))
+    best = np.empty_like(reach)
+    # as many agents at a time as fit in a core's cache
+    some = max(1, _CACHE // reach.size)
+    for i in range(0, len(reach), some):
+        known = np.maximum(reach, barrier[i : i + some, :, None])
+        np.minimum.reduce(known, axis=1, initial=np.float32(cap), out=best[i : i + some])
+    return best
 
 
 def contacts(
