@@ -127,17 +127,14 @@ def bench(
         raise typer.BadParameter(
             f"a name that ends in {', '.join(_PICTURES)}, got {plot}", param_hint="--plot"
         )
+    batches, counts = _numbers(num_envs, "--num-envs", 1), _numbers(threads, "--threads", 0)
+
     from hipg_bench.cli.evaluate import suite_of
     from hipg_bench.evaluation.bench import plan
     from hipg_bench.evaluation.bench.child import run
 
-    asked = plan.request(
-        suite_of(tasks or ("all" if full else "standard")).specs,
-        num_envs=_numbers(num_envs, "--num-envs", 1),
-        threads=_numbers(threads, "--threads", 0),
-        seconds=seconds,
-        full=full,
-    )
+    specs = suite_of(tasks or ("all" if full else "standard")).specs
+    asked = plan.request(specs, num_envs=batches, threads=counts, seconds=seconds, full=full)
     jobs = {name: _jobs(name, asked) for name in wanted}
     rows: dict[str, list[Any]] = {name: [] for name in wanted}
     started = time.monotonic()
