@@ -9,6 +9,9 @@ from hipg_bench.evaluation.bench.steps import stepping
 from hipg_bench.evaluation.bench.timing import Contender, in_turn
 from hipg_bench.spec import TaskSpec
 
+_OFTEN = 64
+"""Steps of one world while the largest batch does one, at most."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
@@ -58,23 +61,40 @@ def _sweep(
     sweep: str, points: Mapping[tuple[int, int], TaskSpec], threads: int, seconds: float
 ) -> list[Cost]:
     """Time every point (N, B) in turn with the others."""
-    steps: dict[str, Contender] = {
-        f"{size} {num_envs}": stepping(spec, num_envs, threads)[1]
-        for (size, num_envs), spec in points.items()
+    most = max(num_envs for _, num_envs in points)
+    # small batches step more often, so that a turn is long enough to be timed
+    often = {point: min(most // point[1], _OFTEN) for point in points}
+    contenders = {
+        _name(point): _repeated(stepping(spec, point[1], threads)[1], often[point])
+        for point, spec in points.items()
     }
-    times = in_turn(steps, seconds)
-    least_agents, least_envs = min(points)
-    base = f"{least_agents} {least_envs}"
+    times = in_turn(contenders, seconds)
+    base = min(points)
     out: list[Cost] = []
-    for (size, num_envs), spec in points.items():
-        name = f"{size} {num_envs}"
-        growth = times.ratio(name, base) * least_envs / num_envs
+    for point, spec in points.items():
+        size, num_envs = point
+        steps, base_steps = often[point] * num_envs, often[base] * base[1]
+        growth = times.ratio(_name(point), _name(base)) * base_steps / steps
         out.append(
             Cost(
                 spec.task, sweep, size, num_envs, threads,
-                step_us=1e6 * times.median(name) / num_envs,
+                step_us=1e6 * times.median(_name(point)) / steps,
                 growth=growth,
-                growth_per_agent=growth * least_agents / size,
+                growth_per_agent=growth * base[0] / size,
             )
         )  # fmt: skip
     return out
+
+
+def _name(point: tuple[int, int]) -> str:
+    return f"{point[0]} agents, {point[1]} worlds"
+
+
+def _repeated(step: Contender, count: int) -> Contender:
+    """Several calls as one."""
+
+    def call() -> None:
+        for _ in range(count):
+            step.call()
+
+    return Contender(call)
