@@ -187,7 +187,8 @@ class BatchEnv:
         (ended,) = done.nonzero()
         end_reason = np.full(self.num_envs, "")
         if len(ended):
-            end_reason = np.select([diverged, ruled, truncated], ["physics", reason, "horizon"], "")
+            by_rule = np.where(ruled, reason, np.where(truncated, "horizon", ""))
+            end_reason = np.where(diverged, "physics", by_rule)
 
         # what was seen, then the next episode where this one is over
         observation, state = self._perceive(now)
