@@ -1,4 +1,4 @@
-"""BenchMARL's QMIX, for which actions are made discrete: each agent pushes along one axis at a time, or rests."""
+"""BenchMARL's QMIX, on actions made discrete: each agent pushes along one axis at a time, or rests."""
 
 import argparse
 import tempfile
