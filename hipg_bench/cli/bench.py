@@ -132,12 +132,13 @@ def bench(
     from hipg_bench.cli.evaluate import suite_of
     from hipg_bench.evaluation.bench import plan
     from hipg_bench.evaluation.bench.child import run
+    from hipg_bench.evaluation.bench.machine import machine
 
     specs = suite_of(tasks or ("all" if full else "standard")).specs
     asked = plan.request(specs, num_envs=batches, threads=counts, seconds=seconds, full=full)
     jobs = {name: _jobs(name, asked) for name in wanted}
     rows: dict[str, list[Any]] = {name: [] for name in wanted}
-    started = time.monotonic()
+    host, started = machine(), time.monotonic()
     with console.progress() as bars:
         bar = bars.add_task("bench", total=sum(len(of_section) for of_section in jobs.values()))
         for name in wanted:
@@ -147,12 +148,12 @@ def bench(
                 bars.advance(bar)
             if not as_json:
                 _show(name, rows[name])
-    document = plan.document(asked, rows, time.monotonic() - started)
+    document = plan.document(asked, rows, host, time.monotonic() - started)
     if as_json:
         console.show_json(document)
     else:
-        told = document["machine"]
-        console.say(f"\n[dim]{told['processor']}, {told['cores']} cores, load {told['load']}[/dim]")
+        busy = f"load {host['load']} before" if host["load"] > host["cores"] / 4 else "idle before"
+        console.say(f"\n[dim]{host['processor']}, {host['cores']} cores, {busy}[/dim]")
     if plot is not None:
         from hipg_bench.evaluation.bench.plot import draw
 

@@ -10,7 +10,7 @@ from hipg_bench.errors import RenderError
 from hipg_bench.evaluation.bench import films
 from hipg_bench.evaluation.bench.child import Job
 from hipg_bench.evaluation.bench.faces import overheads
-from hipg_bench.evaluation.bench.machine import machine, usable_cores, versions
+from hipg_bench.evaluation.bench.machine import usable_cores, versions
 from hipg_bench.evaluation.bench.scaling import over_agents, over_worlds
 from hipg_bench.evaluation.bench.scoring import scoring_time
 from hipg_bench.evaluation.bench.start import start_times
@@ -74,11 +74,13 @@ def request(
     )
 
 
-def document(asked: Request, sections: Mapping[str, list[Any]], seconds: float) -> dict[str, Any]:
-    """Everything for a script: rows by section, and what they were measured on."""
+def document(
+    asked: Request, sections: Mapping[str, list[Any]], host: dict[str, Any], seconds: float
+) -> dict[str, Any]:
+    """Everything for a script: rows by section, the machine as it was before, and how long it all took."""
     return {
         "schema": SCHEMA,
-        "machine": machine(),
+        "machine": host,
         "versions": versions(),
         "settings": {
             **dataclasses.asdict(asked),

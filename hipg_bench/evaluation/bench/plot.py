@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ _STYLE: dict[Any, Any] = {
     "axes.titlesize": 13, "axes.titleweight": "bold", "axes.titlelocation": "left", "axes.titlepad": 12,
     "axes.grid": True, "grid.color": "#e6eaee", "axes.axisbelow": True, "legend.frameon": False,
 }  # fmt: skip
+_LINE = 0.034
+"""Height of a line of text, in heights of the axes."""
 _RESOLUTION = 160
 """Dots per inch."""
 
@@ -104,11 +107,18 @@ def _rates(axes: Axes, rows: Rows) -> None:
 def _spread(axes: Axes, values: Sequence[float]) -> list[float]:
     """Heights for labels on a logarithmic axis, moved apart where they would meet; values ascend."""
     low, high = axes.get_ylim()
-    gap = (high / low) ** 0.034  # a line of text, in shares of the axis
-    heights: list[float] = []
+    gap = math.log(high / low) * _LINE
+    logs = [math.log(value) for value in values]
+    pushed_up, pushed_down = _stacked(logs, gap), [-x for x in _stacked([-x for x in reversed(logs)], gap)]
+    return [math.exp((up + down) / 2) for up, down in zip(pushed_up, reversed(pushed_down), strict=True)]
+
+
+def _stacked(values: Sequence[float], gap: float) -> list[float]:
+    """Ascending values, each at least a gap above the one before."""
+    out: list[float] = []
     for value in values:
-        heights.append(max(value, heights[-1] * gap) if heights else value)
-    return heights
+        out.append(max(value, out[-1] + gap) if out else value)
+    return out
 
 
 def _shares(axes: Axes, rows: Rows) -> None:
