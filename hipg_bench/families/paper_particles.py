@@ -232,9 +232,9 @@ class Particles(abc.ABC, Generic[S]):
     def _crash(self, now: S, alive: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
         """Exposure of each agent from its contacts, nats."""
         both, _ = self._overlaps(now, alive)
+        if not (self._law.collision_risk and both.any()):
+            return np.zeros(alive.shape)
         whom = np.concatenate([now.contacts.one[both], now.contacts.other[both]])
-        if not (self._law.collision_risk and len(whom)):
-            return np.zeros(now.health.shape)
         rate = np.full(len(whom), -np.log1p(-self._law.collision_risk))
         return np.bincount(whom, rate, alive.size).reshape(alive.shape)
 
