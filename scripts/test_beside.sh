@@ -46,4 +46,4 @@ if [ ! "$venv/.ready" -nt "$pins" ] || [ ! "$venv/.ready" -nt pyproject.toml ]; 
 fi
 
 exec "$venv/bin/python" -m pytest tests/adapters/test_truth_table.py tests/adapters/test_agreement.py \
-    "tests/adapters/test_face_$name.py" "tests/adapters/test_face_$other.py" -k "$name or $other" "$@"
+    "tests/adapters/test_face_$name.py" "tests/adapters/test_face_$other.py" tests/test_readme.py -k "$name or $other" "$@"
