@@ -201,8 +201,8 @@ class PaperNav(particles.Particles[Snapshot]):
     def _nearest_revealed(self, now: Snapshot) -> Float[np.ndarray, "n N 2"]:
         """Relative position of the nearest revealed hazard, m; zeros before one is known."""
         found = np.zeros(now.position.shape)
-        (ids,) = np.nonzero(now.revealed.any(axis=1))
-        if len(ids):
+        if now.revealed.any():
+            (ids,) = np.nonzero(now.revealed.any(axis=1))
             distance = np.where(now.revealed[ids].T[:, None], now.gaps.away[..., ids], np.inf)
             found[ids] = now.point[ids[:, None], distance.argmin(axis=0).T] - now.position[ids]
         return found

@@ -140,6 +140,7 @@ def repulsion(
     distance = contact.distance[push]
     strength = stiffness * margin * np.logaddexp(0.0, (reach - distance) / margin)
     away = contact.gap[:, push] / distance * strength
-    whom = np.concatenate([contact.other[push], contact.one[push]])
-    force = [np.bincount(whom, np.concatenate([part, -part]), solid.size) for part in away]
-    return np.stack(force, axis=-1).reshape(*solid.shape, 2)
+    whom = 2 * np.concatenate([contact.other[push], contact.one[push]])
+    part = np.concatenate([away, -away], axis=1)
+    force = np.bincount((whom + np.arange(2)[:, None]).ravel(), part.ravel(), 2 * solid.size)
+    return force.reshape(*solid.shape, 2)
