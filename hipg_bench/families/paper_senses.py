@@ -107,7 +107,7 @@ def _count(
     np.add.at(flat, mirrored.take(seen[:mutual]) + histogram.opposite(cell[:mutual]), one_more)
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=2)
 def _origins(
     worlds: int, agents: int, count: int, size: int, others: int, points: int
 ) -> tuple[Int[np.ndarray, "K B"], Int[np.ndarray, "P B"]]:
