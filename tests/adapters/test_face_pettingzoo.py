@@ -214,7 +214,7 @@ def test_a_renderer_that_dies_is_an_error_and_not_a_hang():
     env._live._child._process.kill()
     for _ in range(2):
         env.step({agent: np.zeros(3) for agent in env.agents})
-        with pytest.raises(hipg_bench.errors.RenderError, match="coop_nav-3: .*ended with code -9"):
+        with pytest.raises(hipg_bench.errors.RenderError, match=r"coop_nav-3: .*ended with code -9"):
             env.render()
     env.close()
 
