@@ -134,15 +134,17 @@ class ReplaySettings(RunSettings):
         normalize_inputs: running normalisation of what networks see.
     """
 
+    steps: int = pydantic.Field(default=1_000_000, ge=1)
     num_envs: int = pydantic.Field(default=100, ge=1, le=65536)
-    batch: int = pydantic.Field(default=1024, ge=1, le=1_000_000)
+    gamma: float = pydantic.Field(default=0.95, ge=0, le=1)
+    batch: int = pydantic.Field(default=256, ge=1, le=1_000_000)
     buffer: int = pydantic.Field(default=1_000_000, ge=1, le=100_000_000)
-    learning_starts: int = pydantic.Field(default=51_200, ge=1)
-    update_every: float = pydantic.Field(default=100.0, gt=0)
+    learning_starts: int = pydantic.Field(default=5000, ge=1)
+    update_every: float = pydantic.Field(default=12.0, gt=0)
     rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
-    max_grad_norm: float = pydantic.Field(default=0.5, gt=0)
-    target_share: float = pydantic.Field(default=0.01, gt=0, le=1)
-    hidden: tuple[int, ...] = pydantic.Field(default=(64, 64), min_length=1)
+    max_grad_norm: float = pydantic.Field(default=5.0, gt=0)
+    target_share: float = pydantic.Field(default=0.02, gt=0, le=1)
+    hidden: tuple[int, ...] = pydantic.Field(default=(128, 128), min_length=1)
     mask_dead: bool = True
     normalize_inputs: bool = True
 
@@ -165,11 +167,11 @@ class MaddpgSettings(ReplaySettings):
     """
 
     arm: Literal["maddpg"] = "maddpg"
-    critic_hidden: tuple[int, ...] = pydantic.Field(default=(64, 64), min_length=1)
+    critic_hidden: tuple[int, ...] = pydantic.Field(default=(256, 256), min_length=1)
     critic_sees: Literal["state", "observations"] = "state"
     noise: float = pydantic.Field(default=0.3, ge=0, le=2)
     noise_left: float = pydantic.Field(default=0.3, ge=0, le=1)
-    noise_steps: int = pydantic.Field(default=500_000, ge=1)
+    noise_steps: int = pydantic.Field(default=150_000, ge=1)
     saturation: float = pydantic.Field(default=1e-3, ge=0)
     reach: float = pydantic.Field(default=1.0, gt=0, le=10)
 
@@ -186,10 +188,15 @@ class QmixSettings(ReplaySettings):
     """
 
     arm: Literal["qmix"] = "qmix"
+    gamma: float = pydantic.Field(default=0.9, ge=0, le=1)
+    learning_starts: int = pydantic.Field(default=2000, ge=1)
+    max_grad_norm: float = pydantic.Field(default=10.0, gt=0)
+    target_share: float = pydantic.Field(default=0.01, gt=0, le=1)
+    hidden: tuple[int, ...] = pydantic.Field(default=(64, 64), min_length=1)
     bins: int = pydantic.Field(default=8, ge=2, le=256)
     mixer_width: int = pydantic.Field(default=32, ge=1, le=4096)
     epsilon: float = pydantic.Field(default=0.05, ge=0, le=1)
-    epsilon_steps: int = pydantic.Field(default=500_000, ge=1)
+    epsilon_steps: int = pydantic.Field(default=20_000, ge=1)
 
 
 AnySettings = Settings | MaddpgSettings | QmixSettings
@@ -214,8 +221,15 @@ _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """Where a family does better with other values than the defaults."""
-_MADDPG_BY_FAMILY: Mapping[str, dict[str, Any]] = {}
-_QMIX_BY_FAMILY: Mapping[str, dict[str, Any]] = {}
+_WALKERS_REPLAYED: dict[str, Any] = {"steps": 3_000_000, "update_every": 25, "weights": {"alive": 0.1}}
+_MADDPG_BY_FAMILY: Mapping[str, dict[str, Any]] = {
+    "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.99, "noise_steps": 1_000_000},
+}
+_QMIX_BY_FAMILY: Mapping[str, dict[str, Any]] = {
+    # a longer view, faster targets or slower exploration, and the best of 12 choices at once is so
+    # overestimated that values grow without bound
+    "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.95, "target_share": 0.005},
+}
 
 
 def recommended(task: str, **changes: Any) -> AnySettings:
@@ -256,13 +270,16 @@ _PAPER_WALKERS: dict[str, Any] = {
 
 
 _PAPER_MADDPG: dict[str, Any] = {
-    "steps": 2_500_000, "gamma": 0.95, "rate": 1e-2, "mask_dead": False, "normalize_inputs": False,
-    "critic_sees": "observations",
+    "steps": 2_500_000, "gamma": 0.95, "batch": 1024, "buffer": 1_000_000, "learning_starts": 51_200,
+    "update_every": 100, "rate": 1e-2, "max_grad_norm": 0.5, "target_share": 0.01, "hidden": (64, 64),
+    "critic_hidden": (64, 64), "critic_sees": "observations", "saturation": 1e-3,
+    "mask_dead": False, "normalize_inputs": False,
 }  # fmt: skip
 _PAPER_QMIX: dict[str, Any] = {
     "steps": 5_000_000, "gamma": 0.99, "batch": 100, "buffer": 100_000, "learning_starts": 1000,
-    "update_every": 100, "rate": 5e-4, "max_grad_norm": 10.0, "target_share": 0.2, "epsilon": 0.02,
-    "epsilon_steps": 10_000, "mask_dead": False, "normalize_inputs": False,
+    "update_every": 100, "rate": 5e-4, "max_grad_norm": 10.0, "target_share": 0.2, "hidden": (64, 64),
+    "bins": 8, "mixer_width": 32, "epsilon": 0.02, "epsilon_steps": 10_000,
+    "mask_dead": False, "normalize_inputs": False,
 }  # fmt: skip
 
 
