@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hipg_bench.cli import console
 from hipg_bench.errors import SpecError, hint
+
+if TYPE_CHECKING:
+    from hipg_bench.learning.settings import AnySettings
 
 
 def train(
@@ -48,7 +51,6 @@ def train(
 
     import torch
 
-    from hipg_bench.learning.run import train as run
     from hipg_bench.learning.settings import PRESETS
 
     torch.set_num_threads(threads)
@@ -66,8 +68,15 @@ def train(
         *(f"--set {pair}" for pair in setting or []),
     ]
     command = " ".join(["hipg-bench train", *options, f"--steps {settings.steps}", f"--out {out}"])
+    _train_one(settings, out, command)
+
+
+def _train_one(settings: AnySettings, out: Path, command: str) -> None:
+    from hipg_bench.learning.run import train as run
+
     console.say(
-        f"[bold]{task}[/bold], arm {arm}, seed {seed}: {settings.steps:,} environment steps into {out}"
+        f"[bold]{settings.task}[/bold], arm {settings.arm}, seed {settings.seed}: "
+        f"{settings.steps:,} environment steps into {out}"
     )
     with console.progress() as bars:
         bar = bars.add_task("training", total=settings.iterations)
