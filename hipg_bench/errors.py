@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Literal
+
+FailureStatus = Literal["crash", "timeout", "not_finite", "wrong_shape"]
+"""How an agent may fail: its process ended, it was too slow, or its answer is no action."""
 
 
 class HipgError(Exception):
@@ -27,6 +31,18 @@ class UnknownNameError(HipgError, KeyError):
 
 class BundleError(HipgError, ValueError):
     """An agent bundle that cannot be read, or does not fit the task."""
+
+
+class AgentFailure(HipgError, RuntimeError):  # noqa: N818  a verdict, not a defect of ours
+    """A submitted agent did not answer as it must; its episode goes on without it and counts.
+
+    Attributes:
+        status: what went wrong, as it stands in the episode's row.
+    """
+
+    def __init__(self, status: FailureStatus, message: str) -> None:
+        super().__init__(message)
+        self.status: FailureStatus = status
 
 
 class RenderError(HipgError, RuntimeError):

@@ -94,8 +94,20 @@ LIBRARIES
     fi
 }
 
+# --- what shuts submitted agents in -----------------------------------------------------------------
+install_sandbox() {
+    if command -v bwrap >/dev/null || [ "$(uname)" != Linux ]; then return; fi
+    if may_apt; then
+        say "installing bubblewrap, the sandbox of submitted agents"
+        apt_install bubblewrap
+    else
+        say "agents that bring code need a sandbox. To add it:  sudo apt-get install bubblewrap"
+    fi
+}
+
 make_venv
 install_packages
 install_gl
+install_sandbox
 touch .venv/.ready
 say "done; .venv/bin/hipg-bench doctor tells what works here"
