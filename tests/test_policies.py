@@ -104,7 +104,26 @@ def bundle(folder, text):
         ),
         ('name = "x"\nsummary = "s"\nbuiltin = "zerro"', "did you mean 'zero'"),
         ('name = "x"\nsummary = "s"\nbuiltin = "os.system"', "no built-in policy 'os.system'"),
-        ('name = "x"\nsummary = "s"\nkind = "python"', "kind = 'python' is refused"),
+        ('name = "x"\nsummary = "s"\nkind = "pickle"', "kind = 'pickle' is refused"),
+        ('name = "x"\nsummary = "s"\nkind = "python"', "kind = 'python' needs 'entry_point', such as"),
+        (
+            'name = "x"\nsummary = "s"\nkind = "python"\nentry_point = "a:make_agent"',
+            "kind = 'python' needs 'tasks', such as [tasks] hazard_nav-4 = [0]",
+        ),
+        (
+            'name = "x"\nsummary = "s"\nkind = "python"\nentry_point = "os.system"',
+            "entry_point = 'os.system' is refused",
+        ),
+        (
+            'name = "x"\nsummary = "s"\nkind = "network"\nentry_point = "a:b"',
+            "'entry_point' belongs to kind = 'python', got kind = 'network'",
+        ),
+        (
+            'name = "x"\nsummary = "s"\nkind = "python"\nentry_point = "a:b"\ntasks = {t = [1, 1]}',
+            "tasks.t = [1, 1]: one or more different seeds",
+        ),
+        ('name = "x"\nsummary = "s"\nbuiltin = "zero"\nlink = "javascript:x"', "link = 'javascript:x'"),
+        ("#" * 70_000, "at most 65536 bytes"),
         ('name = "../x"\nsummary = "s"\nbuiltin = "zero"', "name = '../x' is refused"),
         ('name = "x"\nsumary = "s"\nbuiltin = "zero"', "sum"),
         ("name = ", "agent.toml"),
@@ -119,6 +138,36 @@ def test_bad_bundles_are_refused(tmp_path, text, reason):
 def test_a_folder_without_a_card_is_no_bundle(tmp_path):
     with pytest.raises(BundleError, match=r"no agent\.toml"):
         load_agent(tmp_path)
+
+
+PYTHON = """
+name = "coded"
+summary = "s"
+kind = "python"
+entry_point = "team.agent:make_agent"
+execution = "centralised"
+license = "MIT"
+[tasks]
+"hazard_nav-4" = [3, 1]
+[training]
+env_steps = 1000000
+framework = "by hand"
+"""
+
+
+def test_a_python_card_names_its_tasks_and_its_files_make_its_fingerprint(tmp_path):
+    folder = bundle(tmp_path / "coded", PYTHON)
+    (folder / "agent.py").write_text("one")
+    agent = load_agent(folder)
+    assert (agent.card.tier, agent.card.training.env_steps, agent.card.suite) == (2, 1_000_000, "hipg-1")
+    assert agent.tasks == ("hazard_nav-4",)
+    assert agent.train_seeds("hazard_nav-4") == (1, 3)
+    prints = {agent.fingerprint("hazard_nav-4", seed) for seed in (1, 3)}
+    (folder / "agent.py").write_text("two")
+    assert agent.fingerprint("hazard_nav-4", 1) not in prints
+    assert len(prints) == 2
+    with pytest.raises(BundleError, match="no training seed 0 for hazard_nav-4"):
+        agent.fingerprint("hazard_nav-4", 0)
 
 
 def weights(o, a, scale=1.0):

@@ -45,7 +45,7 @@ def show(
         return
     console.say(f"[bold]{facts['name']}[/bold]: {facts['summary']}")
     console.out.print(facts["folder"], markup=False, soft_wrap=True)
-    for name in ("builtin", "kind", "authors", "license", "link"):
+    for name in ("kind", "builtin", "entry_point", "execution", "authors", "license", "link"):
         if facts[name]:
             console.out.print(f"{name}: {facts[name]}", markup=False)
     if not facts["tasks"]:
@@ -65,12 +65,12 @@ def _facts(agent: Any) -> dict[str, Any]:
             "task": task,
             "train_seeds": list(seeds),
             "fingerprints": [agent.fingerprint(task, seed) for seed in seeds],
-            "command": _command(agent.folder / task / "train.json"),
+            "command": _command(agent.folder / task / f"seed{seeds[0]}.json"),
         }
         for task in agent.tasks
         if (seeds := agent.train_seeds(task))
     ]
-    return agent.card.model_dump() | {"folder": str(agent.folder), "tasks": tasks}
+    return agent.card.model_dump(mode="json") | {"folder": str(agent.folder), "tasks": tasks}
 
 
 def _command(path: Any) -> str:

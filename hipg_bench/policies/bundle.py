@@ -1,7 +1,7 @@
-"""Agent bundles: a folder with ``agent.toml`` and, for networks, weights per task and training seed.
+"""Agent bundles: a folder with ``agent.toml`` and what acts, per task and training seed.
 
-A bundle is data. It names one of the built-in policies or holds tensors; no code is ever imported
-by a name that a file holds.
+It names one of the built-in policies, or holds tensors, ONNX graphs or Python. Nothing that a bundle holds is
+ever imported or run here: graphs and Python run in a sandboxed process of their own (`foreign`).
 """
 
 from __future__ import annotations
@@ -9,22 +9,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import json
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
-
-import pydantic
 
 from hipg_bench import registry
-from hipg_bench.errors import BundleError, HipgError, SpecError, UnknownNameError, hint
+from hipg_bench.errors import BundleError, HipgError, UnknownNameError, hint
 from hipg_bench.paths import data_folder
+from hipg_bench.policies.card import Card, read_card
 from hipg_bench.policies.network import load_network
 from hipg_bench.policies.policy import Policy
 from hipg_bench.policies.scripted import Scripted
 from hipg_bench.policies.simple import Constant, Random, TimeOnly, Zero
-from hipg_bench.spec import Params, TaskSpec, parse
+from hipg_bench.spec import TaskSpec
 
 
 def _action_size(spec: TaskSpec) -> int:
@@ -42,32 +40,19 @@ _BUILTIN: Mapping[str, Callable[[TaskSpec], Policy]] = {
 """What ``builtin`` may name."""
 
 
-class Card(Params):
-    """What ``agent.toml`` says.
-
-    Attributes:
-        name: lower case, digits and underscores; the folder's name for bundled agents.
-        summary: one sentence for lists.
-        builtin: a policy that comes with the package, or
-        kind: ``network``: the folder holds ``<task>/seed<k>.safetensors``.
-        authors, license, link: whom to thank and where to read on.
-    """
-
-    name: str = pydantic.Field(pattern=r"^[a-z0-9][a-z0-9_]{0,63}$")
-    summary: str = pydantic.Field(min_length=1, max_length=300)
-    builtin: str | None = None
-    kind: Literal["network"] | None = None
-    authors: str = ""
-    license: str = ""
-    link: str = ""
-
-
 @dataclasses.dataclass(frozen=True)
 class Agent:
-    """An agent that may play some tasks, perhaps trained several times for each."""
+    """An agent that may play some tasks, perhaps trained several times for each.
+
+    Attributes:
+        card: what it says of itself.
+        folder: where it lies.
+        trust: its code may run without a sandbox; what comes of it is never verified.
+    """
 
     card: Card
     folder: Path
+    trust: bool = False
 
     @property
     def name(self) -> str:
@@ -82,15 +67,19 @@ class Agent:
     @functools.cached_property
     def tasks(self) -> tuple[str, ...]:
         """Names of the tasks that it has a policy for."""
-        if self.card.builtin is None:
-            return tuple(sorted({path.parent.name for path in self.folder.glob("*/seed*.safetensors")}))
-        return tuple(name for name, spec in registry.tasks().items() if self._plays(spec))
+        if self.card.kind == "builtin":
+            return tuple(name for name, spec in registry.tasks().items() if self._plays(spec))
+        if self.card.kind == "python":
+            return tuple(sorted(self.card.tasks))
+        return tuple(sorted({path.parent.name for path in self.folder.glob(f"*/seed*{self._ending}")}))
 
     def train_seeds(self, task: str) -> tuple[int, ...]:
         """Training seeds with a policy for a task: (0,) for what is not trained, () if there is none."""
-        if self.card.builtin is not None:
+        if self.card.kind == "builtin":
             return (0,) if task in self.tasks else ()
-        names = [path.stem for path in (self.folder / task).glob("seed*.safetensors")]
+        if self.card.kind == "python":
+            return tuple(sorted(self.card.tasks.get(task, ())))
+        names = [path.stem for path in (self.folder / task).glob(f"seed*{self._ending}")]
         return tuple(sorted(int(name[4:]) for name in names if re.fullmatch(r"seed\d+", name)))
 
     def policy(self, spec: TaskSpec, train_seed: int = 0) -> Policy:
@@ -99,11 +88,33 @@ class Agent:
         Raises:
             BundleError: it has none for the task or training seed, or the weights do not fit.
         """
-        if self.card.builtin is not None:
-            try:
-                return _BUILTIN[self.card.builtin](spec)
-            except UnknownNameError as error:
-                raise BundleError(f"agent {self.name!r} does not play {spec.task}: {error}") from error
+        match self.card.kind:
+            case "builtin":
+                return self._builtin(spec)
+            case "network":
+                return self._network(spec, train_seed)
+            case _:
+                raise BundleError(f"agent {self.name!r}: kind {self.card.kind!r} cannot be played yet")
+
+    def fingerprint(self, task: str, train_seed: int = 0) -> str:
+        """Twelve hex digits that tell one policy of this agent from another."""
+        match self.card.kind:
+            case "builtin":
+                content = str(self.card.builtin).encode()
+            case "python":
+                self._check_trained(task, train_seed)
+                content = json.dumps([task, train_seed, digests(self.folder)]).encode()
+            case _:
+                content = self._weights(task, train_seed).read_bytes()
+        return hashlib.sha256(content).hexdigest()[:12]
+
+    def _builtin(self, spec: TaskSpec) -> Policy:
+        try:
+            return _BUILTIN[str(self.card.builtin)](spec)
+        except UnknownNameError as error:
+            raise BundleError(f"agent {self.name!r} does not play {spec.task}: {error}") from error
+
+    def _network(self, spec: TaskSpec, train_seed: int) -> Policy:
         network = load_network(self._weights(spec.task, train_seed))
         layout = registry.family_of(spec).layout
         sizes, expected = (
@@ -116,24 +127,26 @@ class Agent:
             )
         return network
 
-    def fingerprint(self, task: str, train_seed: int = 0) -> str:
-        """Twelve hex digits that tell one policy of this agent from another."""
-        if self.card.builtin is not None:
-            return hashlib.sha256(self.card.builtin.encode()).hexdigest()[:12]
-        return hashlib.sha256(self._weights(task, train_seed).read_bytes()).hexdigest()[:12]
+    @property
+    def _ending(self) -> str:
+        """Of the files that hold its policies."""
+        return {"network": ".safetensors", "onnx": ".onnx"}[self.card.kind]
 
     def _weights(self, task: str, train_seed: int) -> Path:
-        path = self.folder / task / f"seed{train_seed}.safetensors"
-        if path.is_file():
-            return path
+        self._check_trained(task, train_seed)
+        return self.folder / task / f"seed{train_seed}{self._ending}"
+
+    def _check_trained(self, task: str, train_seed: int) -> None:
+        """Refuse what it was not trained for."""
         seeds = self.train_seeds(task)
-        if seeds:
+        if not seeds:
+            raise BundleError(
+                f"agent {self.name!r} has no weights for {task}{hint(task, self.tasks) if self.tasks else ''}"
+            )
+        if train_seed not in seeds:
             raise BundleError(
                 f"agent {self.name!r} has no training seed {train_seed} for {task}; there are: {seeds}"
             )
-        raise BundleError(
-            f"agent {self.name!r} has no weights for {task}{hint(task, self.tasks) if self.tasks else ''}"
-        )
 
     def _plays(self, spec: TaskSpec) -> bool:
         try:
@@ -148,31 +161,39 @@ def agents() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in data_folder("agents").glob("*/agent.toml")))
 
 
-def load_agent(name_or_path: str | Path) -> Agent:
+def load_agent(name_or_path: str | Path, *, trust: bool = False) -> Agent:
     """Read a bundle: a bundled agent's name, or the path of a folder with ``agent.toml``.
+
+    Args:
+        name_or_path: which.
+        trust: run its code without a sandbox where none is to be had; for agents of your own.
 
     Raises:
         UnknownNameError: neither; the message holds the nearest name.
         BundleError: ``agent.toml`` is refused.
     """
     if str(name_or_path) in agents():
-        return _read(data_folder("agents") / name_or_path)
+        return _read(data_folder("agents") / name_or_path, trust)
     folder = Path(name_or_path)
     if (folder / "agent.toml").is_file():
-        return _read(folder)
+        return _read(folder, trust)
     if folder.is_dir():
         raise BundleError(f"{folder} holds no agent.toml: it is not an agent bundle")
     raise UnknownNameError(f"no agent {str(name_or_path)!r}{hint(str(name_or_path), agents())}")
 
 
-def _read(folder: Path) -> Agent:
-    path = folder / "agent.toml"
-    try:
-        card = parse(Card, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
-    except (SpecError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BundleError(f"{path}: {error}" if not isinstance(error, SpecError) else str(error)) from error
-    if (card.builtin is None) == (card.kind is None):
-        raise BundleError(f"{path}: exactly one of 'builtin' and 'kind' is allowed")
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, by its path in it, in the order of names."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
+    }
+
+
+def _read(folder: Path, trust: bool) -> Agent:
+    card = read_card(folder / "agent.toml")
     if card.builtin is not None and card.builtin not in _BUILTIN:
-        raise BundleError(f"{path}: no built-in policy {card.builtin!r}{hint(card.builtin, _BUILTIN)}")
-    return Agent(card, folder)
+        raise BundleError(
+            f"{folder / 'agent.toml'}: no built-in policy {card.builtin!r}{hint(card.builtin, _BUILTIN)}"
+        )
+    return Agent(card, folder, trust)
