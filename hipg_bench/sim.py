@@ -69,6 +69,7 @@ class Sim:
         kind = mujoco.mjtState
         before = int(kind.mjSTATE_INTEGRATION) & (int(kind.mjSTATE_USERDATA) - 1)
         self._userdata_start = mujoco.mj_stateSize(model, before)
+        self._default = self._default_row()
         self._disabled = self.batch.expand("opt.disableactuator")
         self._bad = self.batch.warning[:, _BAD_PHYSICS, 1]
 
@@ -98,14 +99,22 @@ class Sim:
 
     def reset(self, ids: Int[np.ndarray, "n"]) -> None:
         """Return worlds to the model's defaults, all agents enabled; userdata becomes 0."""
-        # the engine takes ids in ascending order only
-        self.batch.reset(np.sort(ids), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        # what the engine's own reset does to a row, without waking its threads
+        self.batch.state[ids] = self._default
+        self.batch.warning[ids] = 0
         self._disabled[ids] = 0
 
     @property
     def rows(self) -> Float[np.ndarray, "B R"]:
         """Live view of all worlds."""
         return self.batch.state
+
+    def _default_row(self) -> Float[np.ndarray, "R"]:
+        """The row of a world in the model's default state."""
+        spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        row = np.empty(mujoco.mj_stateSize(self.model, spec))
+        mujoco.mj_getState(self.model, mujoco.MjData(self.model), row, spec)
+        return row
 
     def userdata_of(self, rows: Float[np.ndarray, "n R"], name: str) -> Float[np.ndarray, "n size"]:
         """View of one remembered field in saved rows."""

@@ -124,6 +124,20 @@ def test_saved_rows_go_on_bit_for_bit(env: BatchEnv):
             assert same(value, again[key][name]), (key, name)
 
 
+def test_a_reset_leaves_what_the_engines_own_reset_leaves(env: BatchEnv):
+    sim, ids = env._sim, np.array([2, 0])
+    play(env, env.reset(), 2)
+    sim.position[0] = np.nan
+    assert sim.advance().tolist() == [True, False, False, False]
+    others = sim.rows[[1, 3]].copy()
+    sim.reset(ids)
+    ours = sim.rows[ids].copy()
+    assert not sim.batch.warning[ids].any()
+    assert same(sim.rows[[1, 3]], others)
+    sim.batch.reset(np.sort(ids), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+    assert same(sim.rows[ids], ours)
+
+
 @pytest.mark.parametrize("value", [np.nan, 1e30], ids=["nan", "huge"])
 def test_divergence_ends_only_its_own_episode(
     env: BatchEnv, value: float, tmp_path: object, monkeypatch: pytest.MonkeyPatch
