@@ -45,6 +45,10 @@ class AgentFailure(HipgError, RuntimeError):  # noqa: N818  a verdict, not a def
         self.status: FailureStatus = status
 
 
+class BoardError(HipgError, RuntimeError):
+    """A leaderboard that refuses a change: a name that is taken, a salt that is not the right one."""
+
+
 class RenderError(HipgError, RuntimeError):
     """A frame or film that could not be made."""
 

@@ -1,0 +1,172 @@
+"""The store: a folder per entry, each of which appears, changes and disappears whole.
+
+    commitment.json         hash of the salt behind the hidden worlds
+    entries/<name>/         what is known of an entry now
+    history/<name>/v<k>/    what was known of its earlier versions
+    .draft-*  .ready-*      writers at work, or killed; the next writer cleans up after the dead
+
+A draft is built beside the entries and takes its place by one rename, so whoever is killed leaves the board
+as it was. Where an entry is replaced, the rename to ``.ready-<name>`` decides; what is left to do
+after it, the next one who opens the board does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Generator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from hipg_bench.errors import BoardError, UnknownNameError, hint
+from hipg_bench.leaderboard.entry import Entry, read_entry
+from hipg_bench.paths import write_text
+
+_DRAFT, _READY = ".draft-", ".ready-"
+
+
+class Board:
+    """A board's folder.
+
+    Args:
+        root: the folder; made when something is first written to it.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the entries."""
+        with self._alone():
+            return self._names()
+
+    def folder(self, name: str) -> Path:
+        """An entry's folder.
+
+        Raises:
+            UnknownNameError: no such entry; the message holds the nearest name.
+        """
+        if name not in self.names():
+            raise UnknownNameError(f"no entry {name!r} in {self.root}{hint(name, self._names())}")
+        return self._place(name)
+
+    def entry(self, name: str) -> Entry:
+        """What is known of an entry.
+
+        Raises:
+            UnknownNameError: no such entry.
+            SpecError: its ``entry.json`` is damaged.
+        """
+        return read_entry(self.folder(name))
+
+    @contextlib.contextmanager
+    def draft(self, name: str, replaces: Entry | None = None) -> Generator[Path]:
+        """Yield an empty folder to fill; it becomes the entry when the block ends well.
+
+        Args:
+            name: the entry's.
+            replaces: the entry as it was read; None for a new name.
+
+        Raises:
+            BoardError: the name is taken, or the entry is no longer the one that was read.
+        """
+        with self._alone():
+            self._check(name, replaces)
+            draft = Path(tempfile.mkdtemp(prefix=f"{_DRAFT}{name}-", dir=self.root))
+            # held while we live: this tells our draft from one of a dead process
+            alive = FileLock(_lock_of(draft))
+            alive.acquire()
+        try:
+            yield draft
+            with self._alone():
+                self._check(name, replaces)
+                self._publish(name, draft, replaces)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+            alive.release()
+            _lock_of(draft).unlink(missing_ok=True)
+
+    def write(self, folder: Path, entry: Entry) -> None:
+        """Write ``entry.json`` into a draft."""
+        write_text(folder / "entry.json", entry.model_dump_json(indent=2) + "\n")
+
+    @contextlib.contextmanager
+    def _alone(self) -> Generator[None]:
+        """Be the only one that renames things here, after those who were killed doing so."""
+        if not self.root.is_dir():
+            self.root.mkdir(parents=True, exist_ok=True)
+        with FileLock(self.root / ".lock"):
+            self._clean()
+            yield
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(sorted(path.parent.name for path in (self.root / "entries").glob("*/entry.json")))
+
+    def _place(self, name: str) -> Path:
+        return self.root / "entries" / name
+
+    def _check(self, name: str, replaces: Entry | None) -> None:
+        there = read_entry(self._place(name)) if name in self._names() else None
+        if there is not None and replaces is None:
+            raise BoardError(f"the board has an entry {name!r} already: choose another name, or --replace it")
+        if there != replaces:
+            raise BoardError(
+                f"entry {name!r} changed while this was running: nothing was written; run it again"
+            )
+
+    def _publish(self, name: str, draft: Path, replaces: Entry | None) -> None:
+        (self.root / "entries").mkdir(exist_ok=True)
+        draft.chmod(0o755)
+        if replaces is None:
+            draft.rename(self._place(name))
+        else:
+            ready = self.root / f"{_READY}{name}"
+            draft.rename(ready)
+            self._finish(ready)
+
+    def _finish(self, ready: Path) -> None:
+        """Move an entry that is decided upon to its place, and the one there out of the way."""
+        name = ready.name.removeprefix(_READY)
+        place = self._place(name)
+        if place.exists():
+            earlier = read_entry(place).version
+            if earlier < read_entry(ready).version:
+                kept = self.root / "history" / name / f"v{earlier}"
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                place.rename(kept)
+            else:
+                place.rename(self.root / f"{_DRAFT}{name}-old-{os.getpid()}")
+        ready.rename(place)
+        self._clean_drafts()
+
+    def _clean(self) -> None:
+        for ready in self.root.glob(f"{_READY}*"):
+            self._finish(ready)
+        self._clean_drafts()
+
+    def _clean_drafts(self) -> None:
+        """Remove the drafts of processes that are no more."""
+        for lock in self.root.glob(f"{_DRAFT}*.lock"):
+            if not lock.with_suffix("").exists():
+                self._bury(lock.with_suffix(""))
+        for draft in self.root.glob(f"{_DRAFT}*"):
+            if draft.is_dir():
+                self._bury(draft)
+
+    @staticmethod
+    def _bury(draft: Path) -> None:
+        lock = FileLock(_lock_of(draft))
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            return
+        shutil.rmtree(draft, ignore_errors=True)
+        lock.release()
+        _lock_of(draft).unlink(missing_ok=True)
+
+
+def _lock_of(draft: Path) -> Path:
+    return draft.with_name(draft.name + ".lock")
