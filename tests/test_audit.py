@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 
 from hipg_bench import make
 from hipg_bench.cli import app
-from hipg_bench.errors import HipgError
+from hipg_bench.errors import HipgError, SpecError
 from hipg_bench.learning import audit
 from hipg_bench.learning.mappo import networks
 from hipg_bench.learning.run import train
@@ -94,7 +95,7 @@ def test_an_audit_of_a_run(tmp_path: Path) -> None:
     assert found.dead_share.sum() == pytest.approx(1.0)
     assert found.cases <= 4 * 2 * 4
     assert len(found.credit.learned) == found.cases
-    with pytest.raises(HipgError, match="checkpoint"):
+    with pytest.raises(HipgError, match="not there"):
         audit.load(tmp_path / "nowhere")
 
 
@@ -110,3 +111,40 @@ def test_the_command_prints_what_it_found_and_draws_it(tmp_path: Path) -> None:
     facts = json.loads(CliRunner().invoke(app, ["audit", "--run", str(tmp_path), *size, "--json"]).stdout)
     found = audit.audit(*audit.load(tmp_path), worlds=4, moments=2, repeats=2)
     assert facts["credit"]["bias"] == pytest.approx(found.credit.bias, abs=1e-6)
+
+
+def test_a_bundle_is_audited_as_its_run(tmp_path: Path) -> None:
+    """The critic that lies beside committed weights is the run's own, bit for bit."""
+    train(recommended("hazard_nav-4", **SMALL), tmp_path / "run", command="test")
+    learner = tmp_path / "run" / "learner.safetensors"
+    for ours, theirs in zip(audit.load(tmp_path / "run")[:2], audit.load(learner)[:2], strict=True):
+        tensors = theirs.state_dict()
+        assert all(torch.equal(tensor, tensors[name]) for name, tensor in ours.state_dict().items())
+    bundle = tmp_path / "mine"
+    (bundle / "hazard_nav-4").mkdir(parents=True)
+    (bundle / "agent.toml").write_text('name = "mine"\nsummary = "a test"\nkind = "network"\n')
+    shutil.copy(learner, bundle / "hazard_nav-4" / "seed0.learner.safetensors")
+    size = ["--worlds", "4", "--moments", "2", "--repeats", "2", "--json"]
+    of_run, of_bundle = (
+        json.loads(CliRunner().invoke(app, ["audit", *which, *size]).stdout)
+        for which in (["--run", str(tmp_path / "run")], ["--agent", str(bundle), "--task", "hazard_nav-4"])
+    )
+    assert {**of_run, "run": ""} == {**of_bundle, "run": ""}
+    missing = ["audit", "--agent", str(bundle), "--task", "hazard_nav-4", "--seed", "3"]
+    with pytest.raises(HipgError, match=r"seed 3; there are: hazard_nav-4/seed0"):
+        CliRunner().invoke(app, missing, catch_exceptions=False)
+    with pytest.raises(SpecError, match="either"):
+        CliRunner().invoke(app, ["audit"], catch_exceptions=False)
+
+
+@pytest.mark.parametrize("content", [b"not a file of tensors", b""])
+def test_a_file_that_holds_no_networks_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "learner.safetensors").write_bytes(content)
+    with pytest.raises(HipgError, match="cannot be read"):
+        audit.load(tmp_path / "learner.safetensors")
+
+
+def test_a_critic_of_each_ones_own_cannot_be_asked(tmp_path: Path) -> None:
+    train(recommended("coop_nav-3", arm="local", **SMALL), tmp_path, command="test")
+    with pytest.raises(HipgError, match="local critic"):
+        audit.load(tmp_path / "learner.safetensors")

@@ -2,12 +2,14 @@
 
 import csv
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from hipg_bench import make
 from hipg_bench.errors import ResumeError, SpecError
 from hipg_bench.learning import credit, sweep
 from hipg_bench.learning.gae import gae
@@ -17,7 +19,10 @@ from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, paper, recommended
 from hipg_bench.policies.network import load_network, save_network
 
-SMALL = {"num_envs": 8, "rollout": 10, "steps": 8 * 10 * 4, "actor_hidden": (16,), "critic_hidden": (16,)}
+SMALL = {
+    "num_envs": 8, "rollout": 10, "steps": 8 * 10 * 4, "actor_hidden": (16,), "critic_hidden": (16,),
+    "eval_every": 2 * 80,
+}  # fmt: skip
 
 
 def column(*values: float) -> torch.Tensor:
@@ -180,6 +185,70 @@ def test_a_resumed_run_is_the_same_run(tmp_path: Path) -> None:
     for a, b in zip(*rows, strict=True):
         assert {**a, "seconds": ""} == {**b, "seconds": ""}
     assert json.loads((tmp_path / "cut" / "train.json").read_text())["env_steps"] == 320
+
+
+def test_a_trial_is_the_plain_loop_over_the_policy_file(tmp_path: Path) -> None:
+    """Worlds nobody is trained or scored in, one episode of each, on the task's own scale."""
+    train(recommended("hazard_nav-4", **SMALL), tmp_path, command="test")
+    rows = list(csv.DictReader((tmp_path / "curve.csv").open()))
+    assert [bool(row["score"]) for row in rows] == [False, True, False, True]
+    policy, returns = load_network(tmp_path / "policy.safetensors"), list[float]()
+    env = make("hazard_nav-4", 1, seed=30_000, threads=1)
+    for episode in range(32):
+        step, total = env.reset(np.array([episode])), 0.0
+        for _ in range(env.spec.horizon):
+            action, _ = policy.act(step.observation, None, step.info["alive"])
+            step = env.step(action)
+            total += float(step.reward[0])
+        returns.append(total)
+    anchors = env.spec.anchors
+    low, high = anchors.random.mean, anchors.reference.mean
+    # Student's t with 31 degrees of freedom leaves 2.5 % above 2.0395 (tables)
+    half = 2.0395 * np.std(returns, ddof=1) / math.sqrt(32)
+    expected = {
+        "eval_return": np.mean(returns),
+        "score": (np.mean(returns) - low) / (high - low),
+        "score_low": (np.mean(returns) - half - low) / (high - low),
+        "score_high": (np.mean(returns) + half - low) / (high - low),
+    }
+    for name, value in expected.items():
+        assert float(rows[-1][name]) == pytest.approx(value, rel=1e-4), name
+
+
+def test_trials_change_nothing_of_the_run(tmp_path: Path) -> None:
+    """Nor does how often they are held: a run goes on with another ``eval_every``."""
+    train(recommended("hazard_nav-4", **SMALL), tmp_path / "some", command="test")
+    often = {**SMALL, "eval_every": 1}
+    train(recommended("hazard_nav-4", **{**often, "steps": 160}), tmp_path / "many", command="test")
+    train(recommended("hazard_nav-4", **{**often, "eval_every": 0}), tmp_path / "many", command="test")
+    some, many = ((tmp_path / name / "policy.safetensors").read_bytes() for name in ("some", "many"))
+    assert some == many
+    rows = list(csv.DictReader((tmp_path / "many" / "curve.csv").open()))
+    assert [bool(row["score"]) for row in rows] == [True, True, False, True]
+
+
+def test_a_run_from_before_trials_goes_on(tmp_path: Path) -> None:
+    """Its checkpoint names no ``eval_every``, its curve has no scores, and no critic lies beside it."""
+    train(recommended("hazard_nav-4", **SMALL), tmp_path / "whole", command="test")
+    train(recommended("hazard_nav-4", **{**SMALL, "steps": 160}), tmp_path / "old", command="test")
+    path = tmp_path / "old" / "checkpoint.pt"
+    content = torch.load(path, weights_only=True)
+    settings = json.loads(content["settings"])
+    del settings["eval_every"]
+    torch.save({**content, "settings": json.dumps(settings)}, path)
+    curve = tmp_path / "old" / "curve.csv"
+    rows = list(csv.DictReader(curve.open()))
+    old = [name for name in rows[0] if "score" not in name and name != "eval_return"]
+    lines = [",".join(old), *(",".join(row[name] for name in old) for row in rows)]
+    curve.write_text("\n".join(lines) + "\n")
+    (tmp_path / "old" / "learner.safetensors").unlink()
+    train(recommended("hazard_nav-4", **SMALL), tmp_path / "old", command="test")
+    whole, resumed = ((tmp_path / run / "policy.safetensors").read_bytes() for run in ("whole", "old"))
+    assert whole == resumed
+    assert (tmp_path / "old" / "learner.safetensors").exists()
+    rows = list(csv.DictReader(curve.open()))
+    assert len(rows) == 4
+    assert rows[-1]["score"]
 
 
 def test_another_runs_folder_is_refused(tmp_path: Path) -> None:

@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.errors import HipgError, SpecError
 
 if TYPE_CHECKING:
     from hipg_bench.learning.audit import Audit, Comparison
 
 
 def audit(
-    run: Annotated[Path, typer.Option(help="Folder of a training run.")],
+    run: Annotated[Path | None, typer.Option(help="Folder of a training run of one's own, or")] = None,
+    agent: Annotated[str | None, typer.Option(help="a bundled agent's name or a bundle's folder,")] = None,
+    task: Annotated[str | None, typer.Option(help="with the task,")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="and the training seed.")] = 0,
     worlds: Annotated[int, typer.Option(min=1, help="Episodes that states are taken from.")] = 32,
     moments: Annotated[int, typer.Option(min=1, help="States per episode.")] = 4,
     repeats: Annotated[int, typer.Option(min=2, help="Rollouts per state and dead agent.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Of the episodes and of all luck.")] = 500,
+    luck: Annotated[int, typer.Option(min=0, help="Seed of the episodes and of all luck.")] = 500,
     threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     plot: Annotated[Path | None, typer.Option(help="Calibration plot to write, a PNG.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
@@ -29,14 +33,34 @@ def audit(
     from hipg_bench.learning import audit as audits
 
     torch.set_num_threads(threads)
-    actor, critic, settings = audits.load(run)
-    found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=seed)
+    source = _source(run, agent, task, seed)
+    actor, critic, settings = audits.load(source)
+    found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=luck)
     if plot is not None:
         audits.draw(found, plot, title=f"{settings.task}, {settings.arm}, seed {settings.seed}")
     if as_json:
-        console.show_json(_facts(found) | {"run": str(run), "settings": settings.model_dump()})
+        console.show_json(_facts(found) | {"run": str(source), "settings": settings.model_dump()})
         return
     _print(found, f"{settings.task}, arm {settings.arm}, training seed {settings.seed}")
+
+
+def _source(run: Path | None, agent: str | None, task: str | None, seed: int) -> Path:
+    """Where the networks lie."""
+    if (run is None) == (agent is None) or (agent is None) != (task is None):
+        raise SpecError("audit takes either --run, or --agent and --task")
+    if run is not None:
+        return run
+    from hipg_bench.policies.bundle import load_agent
+
+    who = load_agent(str(agent))
+    path = who.folder / str(task) / f"seed{seed}.learner.safetensors"
+    if not path.is_file():
+        there = sorted(str(one.relative_to(who.folder)) for one in who.folder.glob("*/*.learner.safetensors"))
+        raise HipgError(
+            f"agent {who.name!r} has no critic for {task}, training seed {seed}; "
+            f"there are: {', '.join(there) or 'none'}"
+        )
+    return path
 
 
 def _print(found: Audit, title: str) -> None:

@@ -16,9 +16,11 @@ import math
 from pathlib import Path
 
 import numpy as np
+import safetensors
 import torch
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import HipgError
@@ -160,23 +162,49 @@ def draw(found: Audit, path: Path, *, title: str) -> None:
         figure.savefig(temporary, dpi=120, format="png")
 
 
-def load(run: Path) -> tuple[Actor, Critic, Settings]:
-    """Read the networks of a training run of one's own.
+def load(path: Path) -> tuple[Actor, Critic, Settings]:
+    """Read the networks of a training run.
+
+    Args:
+        path: the run's folder, or a ``learner.safetensors`` that came out of one.
 
     Raises:
-        HipgError: the folder holds no checkpoint, or its critic does not see the joint state.
+        HipgError: there are no networks, they cannot be read, or the critic does not see the joint state.
     """
-    path = run / "checkpoint.pt"
-    if not path.exists():
-        raise HipgError(f"{run} holds no checkpoint.pt: an audit needs the critic of a training run")
-    content = torch.load(path, weights_only=True)
-    settings = parse(Settings, json.loads(content["settings"]), str(path))
-    if settings.arm == "local":
-        raise HipgError(f"{run}: a local critic cannot be asked about the health of others (arm local)")
-    actor, critic = networks(settings, family_of(task_spec(settings.task)).layout)
-    actor.load_state_dict(content["actor"])
-    critic.load_state_dict(content["critic"])
+    source = path / "checkpoint.pt" if path.is_dir() else path
+    if not source.is_file():
+        raise HipgError(f"{source} is not there: an audit needs the critic of a MAPPO run")
+    tensors, text = _checkpoint(source) if source.suffix == ".pt" else _networks(source)
+    try:
+        settings = parse(Settings, json.loads(text), str(source))
+        if settings.arm == "local":
+            raise HipgError(f"{path}: a local critic cannot be asked about the health of others (arm local)")
+        actor, critic = networks(settings, family_of(task_spec(settings.task)).layout)
+        actor.load_state_dict(tensors["actor"])
+        critic.load_state_dict(tensors["critic"])
+    except (json.JSONDecodeError, KeyError, RuntimeError) as error:
+        raise HipgError(f"{source} does not hold the networks of a MAPPO run: {error}") from error
     return actor, critic, settings
+
+
+def _checkpoint(path: Path) -> tuple[dict[str, dict[str, Tensor]], str]:
+    """State dictionaries and settings of a run of one's own."""
+    content = torch.load(path, weights_only=True)
+    return {part: content[part] for part in ("actor", "critic") if part in content}, content["settings"]
+
+
+def _networks(path: Path) -> tuple[dict[str, dict[str, Tensor]], str]:
+    """The same of `Trainer.save_networks`; nothing in the file is run."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get("settings", "")
+            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  not a dict
+    except (safetensors.SafetensorError, OSError) as error:
+        raise HipgError(f"{path} cannot be read: {error}") from error
+    return {
+        part: {name[len(part) + 1 :]: one for name, one in found.items() if name.startswith(f"{part}.")}
+        for part in ("actor", "critic")
+    }, text
 
 
 def redraw_luck(env: BatchEnv, rows: Float[np.ndarray, "X R"], chance: np.random.Generator) -> None:

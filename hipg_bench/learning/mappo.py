@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from safetensors.torch import save_file
 from torch import Tensor
 
 from hipg_bench.env import BatchEnv, Step
@@ -262,6 +263,17 @@ class Trainer:
     def save_policy(self, path: Path) -> None:
         """Write the policy file: the mean action's network."""
         save_network(self.actor.tensors(), path)
+
+    def save_networks(self, path: Path) -> None:
+        """Write actor and critic with all they normalise by, as safetensors: what an audit needs."""
+        parts = {"actor": self.actor, "critic": self.critic}
+        tensors = {
+            f"{part}.{name}": tensor.contiguous()
+            for part, network in parts.items()
+            for name, tensor in network.state_dict().items()
+        }
+        with replacing(path) as temporary:
+            save_file(tensors, temporary, {"settings": self.settings.model_dump_json()})
 
     def save(self, path: Path) -> None:
         """Write a checkpoint, whole or not at all."""

@@ -18,9 +18,10 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from hipg_bench.errors import HipgError
-from hipg_bench.learning import mappo
+from hipg_bench.learning import mappo, trial
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings
 from hipg_bench.paths import write_text
+from hipg_bench.policies.network import load_network
 from hipg_bench.registry import task_spec
 
 _REPLAY = "replay"
@@ -84,9 +85,12 @@ def train(
     """Train in a new folder, or go on where an earlier run with the same settings stopped.
 
     The folder gets ``checkpoint.pt`` (all that is needed to go on), ``policy.safetensors`` and
-    ``curve.csv`` and ``train.json`` (what an agent bundle needs), and TensorBoard events; a kill loses at
-    most one iteration. What MADDPG and QMIX replay lies in ``replay`` until they are finished: to take
-    them further than that needs a new folder.
+    ``curve.csv`` and ``train.json`` (what an agent bundle needs), from MAPPO ``learner.safetensors`` (what an
+    audit needs), and TensorBoard events; a kill loses at most one iteration. What MADDPG and QMIX replay
+    lies in ``replay`` until they are finished: to take them further than that needs a new folder.
+
+    Every ``eval_every`` steps and at the end the policy is tried (`hipg_bench.learning.trial`). That is
+    for the curve alone: it changes nothing of the run, and the policy that counts is the last one.
 
     Args:
         settings: the run; ``steps`` may be larger than before.
@@ -100,16 +104,20 @@ def train(
     """
     out.mkdir(parents=True, exist_ok=True)
     learner = new_learner(settings, out)
-    checkpoint, curve = out / "checkpoint.pt", out / "curve.csv"
+    checkpoint, curve, policy = out / "checkpoint.pt", out / "curve.csv", out / "policy.safetensors"
     rows: list[dict[str, Any]] = []
     if checkpoint.exists():
         learner.resume(checkpoint)
         rows = list(csv.DictReader(io.StringIO(curve.read_text())))[: learner.iteration]
     before = float(rows[-1]["seconds"]) if rows else 0.0
+    worlds = trial.Trial(settings.task, threads=torch.get_num_threads())
     started = time.monotonic()
     with SummaryWriter(str(out / "tensorboard"), purge_step=learner.iteration) as board:
         while learner.iteration < settings.iterations:
             log = learner.iterate()
+            learner.save_policy(policy)
+            if settings.tries_after(learner.iteration):
+                log |= worlds.play(load_network(policy))
             seconds = round(before + time.monotonic() - started, 1)
             steps = learner.iteration * settings.num_envs * settings.rollout
             rows.append({"iteration": learner.iteration, "steps": steps, "seconds": seconds, **log})
@@ -118,7 +126,8 @@ def train(
             if report is not None:
                 report(learner.iteration, log)
             # the checkpoint goes last: what it says was done is then on disk
-            learner.save_policy(out / "policy.safetensors")
+            if isinstance(learner, mappo.Trainer):
+                learner.save_networks(out / "learner.safetensors")
             write_text(curve, _table(rows))
             write_text(out / "train.json", _record(settings, command, steps, seconds))
             learner.save(checkpoint)
@@ -147,6 +156,7 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
         "task_version": spec.version,
         "task_fingerprint": spec.fingerprint,
         "settings": settings.model_dump(),
+        "evaluation": {"seed": trial.SEED, "episodes": trial.EPISODES, "exploration": False},
         "env_steps": steps,
         "agent_steps": steps * spec.num_agents,
         "seconds": seconds,

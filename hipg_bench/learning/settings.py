@@ -26,6 +26,8 @@ class RunSettings(Params):
         rollout: T control steps of each in an iteration.
         gamma: discount.
         weights: reward weights that differ from the task's, in training only; logged returns have them.
+        eval_every: environment steps between two trials of the policy, which change nothing of the run; 0
+            tries it at the end only.
     """
 
     task: str
@@ -35,11 +37,18 @@ class RunSettings(Params):
     rollout: int = pydantic.Field(default=50, ge=1, le=10_000)
     gamma: float = pydantic.Field(default=0.98, ge=0, le=1)
     weights: dict[str, float] = pydantic.Field(default_factory=dict[str, float])
+    eval_every: int = pydantic.Field(default=50_000, ge=0)
 
     @property
     def iterations(self) -> int:
         """Rollouts in all, the last one whole."""
         return -(-self.steps // (self.num_envs * self.rollout))
+
+    def tries_after(self, iteration: int) -> bool:
+        """Whether the policy is tried after an iteration, counted from 1."""
+        each = self.num_envs * self.rollout
+        held, before = ((k * each) // max(self.eval_every, 1) for k in (iteration, iteration - 1))
+        return iteration == self.iterations or (self.eval_every > 0 and held > before)
 
     def check_resumes(self, saved: str, path: Path) -> None:
         """Refuse to go on from the checkpoint of another run.
@@ -50,12 +59,12 @@ class RunSettings(Params):
             path: of the checkpoint, for the message.
 
         Raises:
-            ResumeError: something other than ``steps`` differs.
+            ResumeError: something other than ``steps`` and ``eval_every`` differs.
         """
         theirs, own = json.loads(saved), self.model_dump()
         if theirs["arm"] == own["arm"]:
             theirs = type(self)(**theirs).model_dump()
-        changed = {name for name in own if own[name] != theirs.get(name)} - {"steps"}
+        changed = {name for name in own if own[name] != theirs.get(name)} - {"steps", "eval_every"}
         if changed:
             name = min(changed)
             was = theirs.get(name)
@@ -211,6 +220,8 @@ ARMS: Mapping[str, type[Settings] | type[MaddpgSettings] | type[QmixSettings]] =
 """What a run is told, by arm."""
 
 
+_EPISODES_PER_TRIAL = 1000
+"""A policy is tried each time so many episodes could have been played: 3 % of the time or less."""
 _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     # reward is so rare at first that noise would collapse exploration without a strong bonus
     "hazard_comm": {"epochs": 4, "minibatches": 8, "entropy": 0.01},
@@ -221,7 +232,9 @@ _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """Where a family does better with other values than the defaults."""
-_WALKERS_REPLAYED: dict[str, Any] = {"steps": 3_000_000, "update_every": 25, "weights": {"alive": 0.1}}
+_WALKERS_REPLAYED: dict[str, Any] = {
+    "steps": 3_000_000, "update_every": 25, "weights": {"alive": 0.1}, "eval_every": 200_000,
+}  # fmt: skip
 _MADDPG_BY_FAMILY: Mapping[str, dict[str, Any]] = {
     "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.99, "noise_steps": 1_000_000},
 }
@@ -247,7 +260,8 @@ def recommended(task: str, **changes: Any) -> AnySettings:
 def _parsed(task: str, arm: str, values: dict[str, Any]) -> AnySettings:
     if arm not in ARMS:
         raise SpecError(f"training {task}: no arm {arm!r}{hint(str(arm), ARMS)}")
-    return parse(ARMS[arm], {"task": task, "arm": arm, **values}, f"training {task}")
+    every = _EPISODES_PER_TRIAL * task_spec(task).horizon
+    return parse(ARMS[arm], {"task": task, "arm": arm, "eval_every": every, **values}, f"training {task}")
 
 
 _PAPER: dict[str, Any] = {
