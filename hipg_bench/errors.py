@@ -49,6 +49,14 @@ class BoardError(HipgError, RuntimeError):
     """A leaderboard that refuses a change: a name that is taken, a salt that is not the right one."""
 
 
+class HostFailure(HipgError, RuntimeError):  # noqa: N818  as above
+    """This machine, not the agent, is at fault: its process could not be started, or the disk is full."""
+
+
+class SandboxError(HipgError, RuntimeError):
+    """No way to run foreign code safely works on this machine."""
+
+
 class RenderError(HipgError, RuntimeError):
     """A frame or film that could not be made."""
 
