@@ -11,7 +11,7 @@ import torch
 
 from hipg_bench import make
 from hipg_bench.errors import ResumeError, SpecError
-from hipg_bench.learning import credit, sweep
+from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.mappo import Trainer, surrogate, value_loss
 from hipg_bench.learning.networks import RunningNorm, Tanh
@@ -331,48 +331,3 @@ def test_the_papers_quirks_are_in_its_preset() -> None:
 def test_fast_tanh_is_tanh() -> None:
     x = torch.linspace(-12, 12, 1001)
     torch.testing.assert_close(Tanh()(x), torch.tanh(x), atol=2e-7, rtol=0)
-
-
-SWEEP = """
-[[run]]
-tasks = ["coop_nav-3"]
-arms = ["central", "local"]
-seeds = [0, 1]
-settings = { num_envs = 4, rollout = 5, steps = 40, actor_hidden = [8], critic_hidden = [8] }
-"""
-
-
-def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Path) -> None:
-    (tmp_path / "sweep.toml").write_text(SWEEP)
-    runs = sweep.load(tmp_path / "sweep.toml", tmp_path / "out")
-    assert [(run.settings.arm, run.settings.seed) for run in runs] == [
-        ("central", 0), ("local", 0), ("central", 1), ("local", 1)
-    ]  # fmt: skip
-    done_before = runs[0]
-    train(done_before.settings, done_before.out, command="by hand")
-    seen: list[int] = []
-    sweep.work_off(runs, 2, lambda runs: seen.append(sum(run.finished for run in runs)))
-    assert seen[-1] == 4
-    records = [json.loads((run.out / "train.json").read_text()) for run in runs]
-    assert records[0]["command"] == "by hand", "a finished run is left alone"
-    assert "--arm local" in records[1]["command"]
-    # one thread or a process of its own: the same run
-    train(runs[1].settings, tmp_path / "again", command="by hand")
-    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == (
-        runs[1].out / "policy.safetensors"
-    ).read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (SWEEP + SWEEP, "label"),
-        (SWEEP.replace("central", "centrl"), "arm"),
-        (SWEEP.replace("seeds", "seds"), r"run\.0\.seds"),
-        ("run = 3 =", "readable"),
-    ],
-)
-def test_a_wrong_sweep_is_refused(wrong: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "sweep.toml").write_text(wrong)
-    with pytest.raises(SpecError, match=message):
-        sweep.load(tmp_path / "sweep.toml", tmp_path / "out")

@@ -41,10 +41,14 @@ def train(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Runs of a sweep at a time, by default one per core.")
     ] = None,
+    status: Annotated[bool, typer.Option("--status", help="Only say how far a sweep is.")] = False,
 ) -> None:
     """Train a team, or the many of a sweep; what was killed goes on with the same command."""
-    if (task is None) == (sweep is None):
-        raise SpecError("train takes either --task or --sweep")
+    if (task is None) == (sweep is None) or (status and sweep is None):
+        raise SpecError("train takes either --task or --sweep; --status belongs to the latter")
+    if sweep is not None and status:
+        _tell(sweep, out, workers or os.cpu_count() or 1)
+        return
     if sweep is not None:
         _train_many(sweep, out, workers or os.cpu_count() or 1)
         return
@@ -106,6 +110,38 @@ def _train_many(sweep: Path, out: Path, workers: int) -> None:
 
         work_off(runs, workers, report)
     console.say(f"{len(runs)} runs are finished in {out}")
+
+
+def _tell(sweep: Path, out: Path, workers: int) -> None:
+    import time
+
+    from hipg_bench.learning.sweep import load, standings
+
+    found = standings(load(sweep, out), time.time())
+    rows = console.table("task", "arm", ">seed", "state", ">steps", ">minutes", ">left", title=sweep.name)
+    for one in found:
+        settings = one.run.settings
+        rows.add_row(
+            settings.task,
+            one.run.arm,
+            str(settings.seed),
+            one.state,
+            f"{one.steps:,} / {settings.steps:,}",
+            console.number(one.seconds / 60, 0),
+            console.number(None if one.left is None else one.left / 60, 0),
+        )
+    console.show(rows)
+    known = [one.left for one in found if one.left is not None]
+    hours = (
+        "unknown before a run has begun"
+        if len(known) < len(found)
+        else f"{sum(known) / workers / 3600:.1f} h"
+    )
+    states = ", ".join(
+        f"{sum(one.state == state for one in found)} {state}"
+        for state in ("finished", "running", "stopped", "waiting")
+    )
+    console.say(f"{states}; time left with {workers} at a time: {hours}")
 
 
 def _parsed(pairs: list[str]) -> dict[str, Any]:

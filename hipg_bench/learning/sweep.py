@@ -59,17 +59,42 @@ class Run(NamedTuple):
     settings: AnySettings
     out: Path
     command: str
+    arm: str
+    """The settings' with the group's label: the folder's name."""
+
+    @property
+    def record(self) -> dict[str, Any] | None:
+        """What is on disk: ``train.json``, or None before the first iteration's end."""
+        path = self.out / "train.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     @property
     def done(self) -> int:
         """Environment steps that are on disk."""
-        record = self.out / "train.json"
-        return json.loads(record.read_text())["env_steps"] if record.exists() else 0
+        record = self.record
+        return 0 if record is None else record["env_steps"]
 
     @property
     def finished(self) -> bool:
         """Whether nothing is left to do."""
         return self.done >= self.settings.steps
+
+
+class Standing(NamedTuple):
+    """How far a run is.
+
+    Attributes:
+        state: ``stopped`` is begun, and nothing was written for longer than ten iterations take.
+        steps: environment steps that are done.
+        seconds: that took.
+        left: seconds it will yet take, at its own pace or at that of runs like it; None if none has begun.
+    """
+
+    run: Run
+    state: Literal["waiting", "running", "stopped", "finished"]
+    steps: int
+    seconds: float
+    left: float | None
 
 
 def load(path: Path, out: Path) -> list[Run]:
@@ -117,13 +142,55 @@ def work_off(runs: list[Run], workers: int, report: Callable[[list[Run]], None])
         run.result()
 
 
+def standings(runs: list[Run], now: float) -> list[Standing]:
+    """How far the runs of a sweep are.
+
+    Args:
+        runs: of `load`.
+        now: seconds since the epoch.
+    """
+    records = [run.record for run in runs]
+    paces = [(run, one["seconds"] / one["env_steps"]) for run, one in zip(runs, records, strict=True) if one]
+    return [_standing(run, one, paces, now) for run, one in zip(runs, records, strict=True)]
+
+
+def _standing(
+    run: Run, record: dict[str, Any] | None, paces: list[tuple[Run, float]], now: float
+) -> Standing:
+    if record is None:
+        pace = _pace(run, paces)
+        return Standing(run, "waiting", 0, 0.0, None if pace is None else pace * run.settings.steps)
+    steps, seconds = record["env_steps"], record["seconds"]
+    left = max(0, run.settings.steps - steps) * seconds / steps
+    if left == 0:
+        return Standing(run, "finished", steps, seconds, 0.0)
+    patience = max(60.0, 10 * seconds / steps * run.settings.num_envs * run.settings.rollout)
+    silent = now - (run.out / "train.json").stat().st_mtime
+    return Standing(run, "stopped" if silent > patience else "running", steps, seconds, left)
+
+
+def _pace(run: Run, paces: list[tuple[Run, float]]) -> float | None:
+    """Seconds per step of the runs that are most like one that has not begun."""
+    alike: tuple[Callable[[Run], bool], ...] = (
+        lambda other: (other.settings.task, other.arm) == (run.settings.task, run.arm),
+        lambda other: other.settings.task == run.settings.task,
+        lambda other: True,
+    )
+    for like in alike:
+        found = [pace for other, pace in paces if like(other)]
+        if found:
+            return sum(found) / len(found)
+    return None
+
+
 def _runs(group: Group, out: Path) -> Iterator[Run]:
     for task, arm, seed in itertools.product(group.tasks, group.arms, group.seeds):
         settings = PRESETS[group.preset](task, **{"arm": arm, "seed": seed, **group.settings})
-        folder = out / task / (f"{arm}-{group.label}" if group.label else arm) / f"seed{seed}"
+        labelled = f"{arm}-{group.label}" if group.label else arm
+        folder = out / task / labelled / f"seed{seed}"
         changed = [f"--set {name}={json.dumps(value)}" for name, value in group.settings.items()]
         options = [f"--task {task} --arm {arm} --preset {group.preset} --seed {seed}", *changed]
-        yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]))
+        yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]), labelled)
 
 
 def _train(settings: AnySettings, out: Path, command: str) -> None:

@@ -1,0 +1,115 @@
+"""Many runs from one file: every combination once, what is left, and the files that come along."""
+
+import itertools
+import json
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from hipg_bench.cli import app
+from hipg_bench.errors import SpecError
+from hipg_bench.learning import sweep
+from hipg_bench.learning.run import train
+from hipg_bench.registry import tagged
+
+SWEEP = """
+[[run]]
+tasks = ["coop_nav-3"]
+arms = ["central", "local"]
+seeds = [0, 1]
+settings = { num_envs = 4, rollout = 5, steps = 40, actor_hidden = [8], critic_hidden = [8] }
+"""
+
+
+def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text(SWEEP)
+    runs = sweep.load(tmp_path / "sweep.toml", tmp_path / "out")
+    assert [(run.settings.arm, run.settings.seed) for run in runs] == [
+        ("central", 0), ("local", 0), ("central", 1), ("local", 1)
+    ]  # fmt: skip
+    done_before = runs[0]
+    train(done_before.settings, done_before.out, command="by hand")
+    seen: list[int] = []
+    sweep.work_off(runs, 2, lambda runs: seen.append(sum(run.finished for run in runs)))
+    assert seen[-1] == 4
+    records = [json.loads((run.out / "train.json").read_text()) for run in runs]
+    assert records[0]["command"] == "by hand", "a finished run is left alone"
+    assert "--arm local" in records[1]["command"]
+    # one thread or a process of its own: the same run
+    train(runs[1].settings, tmp_path / "again", command="by hand")
+    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == (
+        runs[1].out / "policy.safetensors"
+    ).read_bytes()
+
+
+def test_a_sweeps_standing_by_hand(tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text(SWEEP)
+    runs = sweep.load(tmp_path / "sweep.toml", tmp_path / "out")  # 40 steps each, 20 an iteration
+    assert {one.left for one in sweep.standings(runs, 0.0)} == {None}
+
+    def write(k: int, steps: int, seconds: float, at: float) -> None:
+        runs[k].out.mkdir(parents=True)
+        (runs[k].out / "train.json").write_text(json.dumps({"env_steps": steps, "seconds": seconds}))
+        os.utime(runs[k].out / "train.json", (at, at))
+
+    write(0, 40, 80.0, at=0.0)  # central, 2 s a step
+    write(1, 20, 20.0, at=900.0)  # local, 1 s a step; ten iterations take 200 s
+    write(2, 20, 100.0, at=0.0)  # central again, 5 s a step; ten iterations take 1000 s
+    found = sweep.standings(runs, now=1001.0)
+    assert [(one.state, one.steps) for one in found] == [
+        ("finished", 40), ("running", 20), ("stopped", 20), ("waiting", 0)
+    ]  # fmt: skip
+    # what has not begun is local: 40 steps at 1 s
+    assert [one.left for one in found] == [0.0, 20.0, 100.0, 40.0]
+    shown = CliRunner().invoke(
+        app, ["train", "--sweep", str(tmp_path / "sweep.toml"), "--out", str(tmp_path / "out"), "--status"]
+    )
+    assert "1 finished" in shown.stdout
+    assert "1 waiting" in shown.stdout
+
+
+def test_the_sweeps_that_come_along_are_what_the_comparison_needs(tmp_path: Path) -> None:
+    folder = Path(__file__).parent.parent / "sweeps"
+    runs = {path.stem: sweep.load(path, tmp_path) for path in folder.glob("*.toml")}
+    seeds = {
+        name: Counter((run.settings.task, run.arm) for run in sweep_runs) for name, sweep_runs in runs.items()
+    }
+    arms = ("min_health", "central", "local")
+    for task in tagged("standard"):
+        wanted = 3 if task.startswith("multiwalker") else 5
+        assert all(seeds["standard"][task, arm] >= wanted for arm in arms), task
+    for task in tagged("paper"):
+        assert all(seeds["paper"][task, arm] >= 4 for arm in arms), task
+        assert seeds["paper"][task, "maddpg"] >= 2, task
+    assert all(seeds["planar"]["multiwalker_planar-3", arm] for arm in (*arms, "maddpg", "qmix"))
+    # one step of the chain at a time: mask, normalisation, baseline
+    chain = [
+        next(run.settings for run in runs[name] if (run.settings.task, run.arm) == ("paper_comm-10", arm))
+        for name, arm in [
+            ("paper", "central"), ("masking", "central-masked"), ("masking", "central-masked_batch"),
+            ("masking", "min_health-masked"), ("paper", "min_health"),
+        ]
+    ]  # fmt: skip
+    steps = [
+        {key for key, value in before.model_dump().items() if getattr(after, key) != value}
+        for before, after in itertools.pairwise(chain)
+    ]
+    assert steps == [{"mask_dead"}, {"psi_over"}, {"arm"}, {"mask_dead"}]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (SWEEP + SWEEP, "label"),
+        (SWEEP.replace("central", "centrl"), "arm"),
+        (SWEEP.replace("seeds", "seds"), r"run\.0\.seds"),
+        ("run = 3 =", "readable"),
+    ],
+)
+def test_a_wrong_sweep_is_refused(wrong: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text(wrong)
+    with pytest.raises(SpecError, match=message):
+        sweep.load(tmp_path / "sweep.toml", tmp_path / "out")
