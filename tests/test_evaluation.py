@@ -114,7 +114,7 @@ def test_an_episode_played_again_alone_is_the_same():
     env = make(TASK)
     np.testing.assert_array_equal(env.recall(states, "elapsed")[:, 0], np.arange(51))
     with pytest.raises(HipgError, match="played again"):
-        plan.record(spec, policy, row | {"return": row["return"] + 1e-9})
+        plan.record(spec, policy, row | {"reached": row["reached"] + 1e-9})
 
 
 class PlugError(Exception):
@@ -155,7 +155,7 @@ def test_interrupted_and_resumed_gives_the_same_bytes(tmp_path):
         name = f"episodes/{task}.jsonl"
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     before, after = (json.loads((tmp_path / run / "results.json").read_text()) for run in ("whole", "parts"))
-    assert {**before, "seconds": 0} == {**after, "seconds": 0}
+    assert {**before, "timing": 0} == {**after, "timing": 0}
 
 
 def test_a_longer_evaluation_extends_a_shorter_one(tmp_path):
@@ -190,7 +190,7 @@ def test_results_are_computed_from_the_rows(tmp_path):
     rows = [json.loads(line) for line in (tmp_path / f"episodes/{TASK}.jsonl").read_text().splitlines()]
     (task,) = results["tasks"]
     returns = np.array([row["return"] for row in rows])
-    assert (results["schema"], results["suite"], results["agent"]) == (1, "custom", "scripted_blind")
+    assert (results["schema"], results["suite"], results["agent"]) == (2, "custom", "scripted_blind")
     assert (task["task"], task["version"], task["episodes"]) == (TASK, task_spec(TASK).version, 70)
     assert task["return_mean"] == pytest.approx(returns.mean())
     assert task["score"] == pytest.approx((returns.mean() + 40) / 30)
@@ -211,7 +211,8 @@ def test_results_are_computed_from_the_rows(tmp_path):
 
 def test_tasks_without_anchors_are_left_out_of_the_aggregate():
     bare = task_spec(TASK).model_copy(update={"anchors": None})
-    rows = [{"train_seed": 0, "score": 0.5}, {"train_seed": 0, "score": 0.7}]
+    # scores 0.5 and 0.7 between anchors at -40 and -10
+    rows = [{"train_seed": 0, "status": "ok", "return": value} for value in (-25.0, -19.0)]
     assert aggregate([(bare, rows)])["score_iqm"] is None
     whole = aggregate([(bare, rows), (anchored(task_spec(TASK)), rows)])
     assert (whole["tasks"], whole["score_iqm"]) == (1, pytest.approx(0.6))

@@ -1,8 +1,8 @@
 """Playing episodes by the protocol: which ones, how many at a time, and what one row says.
 
-World k has evaluation seed ``seed + k // 64`` and episode ``k % 64``; only its first episode counts,
-so that short episodes are not counted more often. What a row holds depends on the task, the policy
-and the world alone: not on the batch size, the threads or the clock.
+World k is episode ``k % 64`` of evaluation seed ``k // 64``; only its first episode counts, so that
+short episodes are not counted more often. What a row holds depends on the task, the split, the policy
+and the world alone: not on the batch size, the threads or the clock. All agents meet the same worlds.
 """
 
 from __future__ import annotations
@@ -10,25 +10,34 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import math
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Collection, Container, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from hipg_bench import registry
-from hipg_bench.env import NEVER, BatchEnv, Step
-from hipg_bench.errors import HipgError
+from hipg_bench.env import Step
+from hipg_bench.errors import AgentFailure, HipgError
+from hipg_bench.evaluation import splits
+from hipg_bench.evaluation.failures import (
+    NOT_PLAYED,
+    OK,
+    Watched,
+    close,
+    counted_return,
+    failures_of_a_dnf,
+)
+from hipg_bench.evaluation.seeds import FIRST_SEED, WORLDS_PER_SEED, hidden_seed
+from hipg_bench.evaluation.worlds import FORCED, Worlds
 from hipg_bench.policies.policy import Policy
+from hipg_bench.registry import family_of
 from hipg_bench.spec import TaskSpec
 
-WORLDS_PER_SEED = 64
-"""Worlds that share an evaluation seed."""
 _COMMON = ("return", "length", "survival", "deaths", "first_death")
 """Metrics every family has; they stand in the row itself."""
 
 Row = dict[str, Any]
-"""One episode, ready for JSON."""
+"""One episode, ready for JSON; ``docs/protocol.md`` explains its fields."""
 Advance = Callable[[float], None]
 """Told how much was played since last time, in episodes."""
 
@@ -46,16 +55,29 @@ class Plan:
         episodes: worlds per policy.
         num_envs: at most so many worlds at once (64 are of use); no result depends on it.
         threads: physics threads, 0 for all cores; no result depends on it.
+        split: what the team meets beside the task; see `hipg_bench.evaluation.splits`.
+        salt: hidden worlds follow from it; None plays the public ones.
     """
 
-    seed: int = 1000
+    seed: int = FIRST_SEED
     episodes: int = 320
     num_envs: int = WORLDS_PER_SEED
     threads: int = 0
+    split: str = splits.STANDARD
+    salt: bytes | None = dataclasses.field(default=None, repr=False)
 
-    def eval_seed(self, world: int) -> int:
+    def eval_seed(self, task: str, world: int) -> int:
         """The environment's seed in a world."""
-        return self.seed + world // WORLDS_PER_SEED
+        block = world // WORLDS_PER_SEED
+        return self.seed + block if self.salt is None else hidden_seed(self.salt, self.split, task, block)
+
+    def told_seed(self, task: str, world: int) -> int | None:
+        """The same as a row tells it: nobody may learn a hidden one."""
+        return self.eval_seed(task, world) if self.salt is None else None
+
+    def spec(self, spec: TaskSpec, world: int) -> TaskSpec:
+        """The task as it is in a world of the split."""
+        return splits.setting(self.split, spec).spec(spec, world // WORLDS_PER_SEED)
 
     def batches(self, done: Container[int] = ()) -> Iterator[list[int]]:
         """The worlds still to play, in order, those of one batch with the same evaluation seed."""
@@ -65,31 +87,50 @@ class Plan:
             for first in range(0, len(left), self.num_envs):
                 yield left[first : first + self.num_envs]
 
-    def play(self, spec: TaskSpec, policy: Policy, worlds: list[int], advance: Advance = silent) -> list[Row]:
-        """Play the first episode of worlds that share an evaluation seed."""
-        seed = self.eval_seed(worlds[0])
-        ids = np.array([world % WORLDS_PER_SEED for world in worlds])
-        env = registry.make(spec, len(worlds), seed, threads=self.threads)
-        rows: list[Row] = [{}] * len(worlds)
-        running = np.ones(len(worlds), bool)
-        told = 0.0
-        for step in _steps(env, policy, seed, ids):
-            ended = step.terminated | step.truncated
-            for place, b in enumerate(np.flatnonzero(ended)):
-                if running[b]:
-                    key = {"world": worlds[b], "eval_seed": seed, "episode_id": int(ids[b])}
-                    rows[b] = key | _outcome(env, step, int(b), step.info["final_rows"][place])
-            running &= ~ended
-            advance(len(worlds) / spec.horizon)
-            told += len(worlds) / spec.horizon
-            if not running.any():
-                break
-        advance(len(worlds) - told)
-        return rows
+    def rows(
+        self, spec: TaskSpec, policy: Policy, done: Collection[Row] = (), advance: Advance = silent
+    ) -> Iterator[list[Row]]:
+        """Play the worlds that are not done, batch by batch; after a DNF enter the rest as not played."""
+        left = failures_of_a_dnf(self.episodes) - sum(row["status"] != OK for row in done)
+        for worlds in self.batches({row["world"] for row in done}):
+            rows = self.play(spec, policy, worlds, advance, failures=left)
+            left -= sum(row["status"] not in (OK, NOT_PLAYED) for row in rows)
+            yield rows
 
     def play_all(self, spec: TaskSpec, policy: Policy, advance: Advance = silent) -> list[Row]:
         """Play all worlds."""
-        return [row for worlds in self.batches() for row in self.play(spec, policy, worlds, advance)]
+        return [row for rows in self.rows(spec, policy, advance=advance) for row in rows]
+
+    def play(
+        self,
+        spec: TaskSpec,
+        policy: Policy,
+        worlds: list[int],
+        advance: Advance = silent,
+        *,
+        failures: int | None = None,
+    ) -> list[Row]:
+        """Play the first episode of worlds that share an evaluation seed.
+
+        Args:
+            spec: the task.
+            policy: who plays; it is closed at the end.
+            worlds: which.
+            advance: told of progress.
+            failures: after so many failed episodes the worlds that follow are not played.
+        """
+        left = len(worlds) + 1 if failures is None else failures
+        if left > 0 and len(worlds) > 1:
+            try:
+                return self._play(spec, policy, worlds, advance)
+            except AgentFailure:
+                pass  # who failed is found out below
+        rows: list[Row] = []
+        for world in worlds:
+            rows += self._play(spec, policy, [world], silent) if left > 0 else [self._not_played(spec, world)]
+            left -= rows[-1]["status"] != OK
+        advance(len(worlds))
+        return rows
 
     def record(self, spec: TaskSpec, policy: Policy, row: Row) -> Float[np.ndarray, "steps R"]:
         """Play an episode again, alone; return its state rows from the start to the end.
@@ -97,20 +138,91 @@ class Plan:
         Raises:
             HipgError: it does not come out as it did: the policy or the physics is not deterministic.
         """
-        env = registry.make(spec, 1, row["eval_seed"], threads=1)
+        worlds, watched = self._begin(spec, policy, [row["world"]], threads=1)
         states: list[np.ndarray] = []
-        for step in _steps(env, policy, row["eval_seed"], np.array([row["episode_id"]])):
-            if step.terminated | step.truncated:
-                states.append(step.info["final_rows"])
-                break
-            states.append(env.rows)
-        again = float(env.recall(states[-1], "return")[0, 0])
-        if again != row["return"]:
+        try:
+            for step in worlds.steps(watched):
+                if step.terminated | step.truncated:
+                    states.append(step.info["final_rows"])
+                    break
+                states.append(worlds.env.rows)
+        finally:
+            close(policy)
+        again = float(worlds.env.recall(states[-1], "return")[0, 0])
+        if again != row["reached"]:
             raise HipgError(
-                f"{spec.task}: world {row['world']} returned {row['return']!r}, played again {again!r}; "
+                f"{spec.task}: world {row['world']} returned {row['reached']!r}, played again {again!r}; "
                 f"the policy's actions depend on more than what it sees and remembers"
             )
         return np.concatenate(states)
+
+    def _begin(
+        self, spec: TaskSpec, policy: Policy, worlds: Sequence[int], threads: int
+    ) -> tuple[Worlds, Watched]:
+        """Build worlds of one block, and watch the policy that is to play them."""
+        place = splits.setting(self.split, spec)
+        ids = np.array([world % WORLDS_PER_SEED for world in worlds])
+        seed = self.eval_seed(spec.task, worlds[0])
+        made = Worlds(spec, place, seed, worlds[0] // WORLDS_PER_SEED, ids, threads)
+        return made, Watched(policy, made.env.action_size, alone=len(worlds) == 1)
+
+    def _play(self, spec: TaskSpec, policy: Policy, worlds: list[int], advance: Advance) -> list[Row]:
+        """Play worlds together; with one world alone a failure stands in its row.
+
+        Raises:
+            AgentFailure: the policy failed, and there are several worlds.
+        """
+        made, watched = self._begin(spec, policy, worlds, self.threads)
+        rows: list[Row] = [{}] * len(worlds)
+        running = np.ones(len(worlds), bool)
+        told = 0.0
+        try:
+            for step in made.steps(watched):
+                ended = step.terminated | step.truncated
+                for place, b in enumerate(np.flatnonzero(ended)):
+                    if running[b]:
+                        came = _outcome(spec, made, watched.status, step, int(b), place)
+                        rows[b] = self._key(spec, worlds[b]) | came
+                running &= ~ended
+                advance(len(worlds) / spec.horizon)
+                told += len(worlds) / spec.horizon
+                if not running.any():
+                    break
+        except AgentFailure:
+            advance(-told)
+            raise
+        finally:
+            close(policy)
+        advance(len(worlds) - told)
+        return rows
+
+    def _key(self, spec: TaskSpec, world: int) -> Row:
+        """Which episode a row is of."""
+        block = world // WORLDS_PER_SEED
+        return {
+            "split": self.split,
+            "world": world,
+            "eval_seed": self.told_seed(spec.task, world),
+            "episode_id": world % WORLDS_PER_SEED,
+            "variant": splits.setting(self.split, spec).variant(block),
+        }
+
+    def _not_played(self, spec: TaskSpec, world: int) -> Row:
+        """The row of a world that a DNF leaves unplayed."""
+        return self._key(spec, world) | {
+            "status": NOT_PLAYED,
+            "return": spec.floor,
+            "reached": None,
+            "score": spec.score(spec.floor) if spec.anchors else None,
+            "length": None,
+            "end_reason": NOT_PLAYED,
+            "survival": None,
+            "deaths": None,
+            "first_death": None,
+            "death_list": [],
+            "others": [],
+            "metrics": dict.fromkeys(family_of(spec).metrics),
+        }
 
 
 def versions() -> dict[str, str]:
@@ -118,44 +230,33 @@ def versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in ("hipg-bench", "mujoco", "numpy")}
 
 
-def _steps(env: BatchEnv, policy: Policy, seed: int, ids: np.ndarray) -> Iterator[Step]:
-    """The start, then one step after another, without end."""
-    step = env.reset(ids)
-    memory = policy.initial_state(seed, ids, env.num_agents)
-    while True:
-        yield step
-        seen = step.info["state"] if policy.privileged else step.observation
-        action, memory = policy.act(seen, memory, step.info["alive"])
-        step = env.step(action)
+def _outcome(spec: TaskSpec, worlds: Worlds, status: str, step: Step, b: int, place: int) -> Row:
+    """What came of the episode that just ended in world b; times in s, undefined numbers None.
 
-
-def _outcome(env: BatchEnv, step: Step, b: int, last: Float[np.ndarray, "R"]) -> Row:
-    """What came of the episode that just ended in world b; times in s, undefined numbers None."""
-    died_at = env.recall(last[None], "death_time")[0]
-    cause = env.recall(last[None], "death_cause")[0]
-    died = sorted((float(died_at[i]), int(i)) for i in np.flatnonzero(died_at != NEVER))
+    Survival and deaths are those of the bodies that the agent steers and the split did not kill.
+    """
     metrics = {name: _number(values[b]) for name, values in step.info["metrics"].items()}
-    first_death = metrics["first_death"]
-    episode_return = float(step.info["metrics"]["return"][b])
+    deaths = worlds.deaths(step.info["final_rows"][place])
+    others = np.flatnonzero(worlds.others[b]).tolist()
+    forced = {death.agent for death in deaths if death.cause == FORCED}
+    own = [death for death in deaths if death.agent not in forced and death.agent not in others]
+    bodies = spec.num_agents - len(forced | set(others))
+    reached = float(step.info["metrics"]["return"][b])
+    counted = counted_return(spec, reached, status)
     return {
-        "return": episode_return,
-        "score": env.spec.score(episode_return) if env.spec.anchors else None,
+        "status": status,
+        "return": counted,
+        "reached": reached,
+        "score": spec.score(counted) if spec.anchors else None,
         "length": int(step.info["metrics"]["length"][b]),
         "end_reason": str(step.info["end_reason"][b]),
-        "survival": metrics["survival"],
-        "deaths": len(died),
-        "first_death": None if first_death is None else _seconds(first_death, env.spec),
-        "death_list": [
-            {"agent": i, "time": _seconds(at, env.spec), "cause": env.family.causes[int(cause[i])]}
-            for at, i in died
-        ],
+        "survival": 1.0 - len(own) / bodies if bodies else None,
+        "deaths": len(own),
+        "first_death": own[0].time if own else None,
+        "death_list": [dataclasses.asdict(death) for death in deaths],
+        "others": others,
         "metrics": {name: value for name, value in metrics.items() if name not in _COMMON},
     }
-
-
-def _seconds(steps: float, spec: TaskSpec) -> float:
-    """Control steps in s, free of the last bits' noise."""
-    return round(steps * spec.control_step, 6)
 
 
 def _number(value: float) -> float | None:

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
-from hipg_bench.errors import RenderError
+from hipg_bench.errors import HipgError, RenderError
 from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.failures import OK
 from hipg_bench.paths import replacing
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.rendering import film, gl
@@ -29,7 +30,7 @@ class Film:
     """One film.
 
     Attributes:
-        spec: of which task.
+        spec: of which task, as it was in that world.
         agent: who plays.
         title: what is seen.
         end_reason: why the episode ended.
@@ -50,15 +51,46 @@ class Film:
         return f"{self.video.parent.name}/{self.video.name}"
 
 
+def choose_all(
+    agent: Agent,
+    specs: Sequence[TaskSpec],
+    rows: Mapping[str, Sequence[Row]],
+    plan: Plan,
+    count: int,
+    out: Path,
+) -> tuple[list[Film], list[str]]:
+    """`choose` for every task.
+
+    Returns:
+        The films, and what went wrong: an agent whose episodes do not come out the same has none.
+    """
+    chosen: list[Film] = []
+    trouble: list[str] = []
+    for spec in specs:
+        try:
+            chosen += choose(agent, spec, rows[spec.task], plan, count, out)
+        except HipgError as error:
+            trouble.append(str(error))
+    return chosen, trouble
+
+
 def choose(
     agent: Agent, spec: TaskSpec, rows: Sequence[Row], plan: Plan, count: int, out: Path
 ) -> list[Film]:
-    """Pick the median episode of the first training seed, then others from worst to best; save the states."""
+    """Pick the median episode of the first training seed, then others from worst to best; save the states.
+
+    Episodes in which the agent failed are not filmed.
+
+    Raises:
+        HipgError: an episode played again came out otherwise.
+    """
     first_seed = min(row["train_seed"] for row in rows)
     ranked = sorted(
-        (row for row in rows if row["train_seed"] == first_seed),
+        (row for row in rows if row["train_seed"] == first_seed and row["status"] == OK),
         key=lambda row: (row["return"], row["world"]),
     )
+    if not ranked:
+        return []
     others = np.linspace(0.0, 1.0, max(count - 1, 1)).tolist()[: max(count - 1, 0)]
     chosen: list[Film] = []
     for quantile in [0.5, *others][:count]:
@@ -68,7 +100,7 @@ def choose(
         what = "the median episode" if median else f"quantile {quantile:.2f}"
         chosen.append(
             Film(
-                spec=spec,
+                spec=plan.spec(spec, row["world"]),
                 agent=agent.name,
                 end_reason=row["end_reason"],
                 title=f"{what}: return {row['return']:.1f}, {row['deaths']} dead",
@@ -138,6 +170,6 @@ def _save(agent: Agent, spec: TaskSpec, row: Row, plan: Plan, path: Path) -> Non
     rows = plan.record(spec, agent.policy(spec, row["train_seed"]), row)
     with replacing(path) as temporary:
         np.savez_compressed(
-            temporary, rows=rows, spec=spec.model_dump_json(), agent=agent.name,
+            temporary, rows=rows, spec=plan.spec(spec, row["world"]).model_dump_json(), agent=agent.name,
             train_seed=row["train_seed"], world=row["world"],
         )  # fmt: skip

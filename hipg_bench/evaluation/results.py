@@ -1,4 +1,4 @@
-"""From rows to numbers: what ``results.json`` says of a task and of a suite."""
+"""From rows to numbers: what ``results.json`` says of a task and of a suite; see ``docs/protocol.md``."""
 
 from __future__ import annotations
 
@@ -9,29 +9,33 @@ from typing import Any
 import numpy as np
 
 from hipg_bench.evaluation.episodes import Row
+from hipg_bench.evaluation.failures import NOT_PLAYED, OK, failures_of_a_dnf
 from hipg_bench.evaluation.statistics import Runs, iqm_ci95, mean_ci95
 from hipg_bench.spec import TaskSpec
 
-SCHEMA = 1
+SCHEMA = 2
 """Raised when a field of ``results.json`` or of a row changes its meaning."""
 
 
 def summarise(spec: TaskSpec, rows: Sequence[Row]) -> dict[str, Any]:
-    """Everything about one task; numbers per episode are means over episodes.
+    """Everything about one task; numbers per episode are means over played episodes.
 
     ``survival`` is the share of agents alive at the end, ``deaths`` how many died, ``first_death`` the
     time in s where somebody did, ``score`` the mean return on the anchors' scale.
     """
-    runs = _runs(rows, "return")
-    mean, interval = mean_ci95(runs)
+    runs = _by_seed(rows)
+    mean, interval = mean_ci95([_returns(spec, run) for run in runs.values()])
     anchored = spec.anchors is not None
+    played = [row for row in rows if row["status"] != NOT_PLAYED]
     return {
         "task": spec.task,
         "version": spec.version,
         "fingerprint": spec.fingerprint,
         "num_agents": spec.num_agents,
         "episodes": len(rows),
-        "train_seeds": sorted({row["train_seed"] for row in rows}),
+        "train_seeds": sorted(runs),
+        "runs": [_run(spec, train_seed, run) for train_seed, run in runs.items()],
+        "dnf": any(_dnf(run) for run in runs.values()),
         "return_mean": mean,
         "return_ci95": list(interval),
         "score": spec.score(mean) if anchored else None,
@@ -40,6 +44,9 @@ def summarise(spec: TaskSpec, rows: Sequence[Row]) -> dict[str, Any]:
         "deaths": _mean(row["deaths"] for row in rows),
         "first_death": _mean(row["first_death"] for row in rows),
         "length": _mean(row["length"] for row in rows),
+        "return_by_deaths": _by_deaths(played),
+        "physics": sum(row["end_reason"] == "physics" for row in rows),
+        "failures": _count(row["status"] for row in rows if row["status"] != OK),
         "end_reasons": _count(row["end_reason"] for row in rows),
         "death_causes": _count(death["cause"] for row in rows for death in row["death_list"]),
         "metrics": {name: _mean(row["metrics"][name] for row in rows) for name in rows[0]["metrics"]},
@@ -49,20 +56,61 @@ def summarise(spec: TaskSpec, rows: Sequence[Row]) -> dict[str, Any]:
 
 def aggregate(played: Sequence[tuple[TaskSpec, Sequence[Row]]]) -> dict[str, Any]:
     """Interquartile mean of the score over tasks that have anchors; unplayed ones count as 0, as random."""
-    scored = [rows for spec, rows in played if spec.anchors is not None]
-    missing = sum(not rows for rows in scored)
+    scored = [(spec, rows) for spec, rows in played if spec.anchors is not None]
+    missing = sum(not rows for _, rows in scored)
     if not scored:
         return {"score_iqm": None, "score_iqm_ci95": None, "tasks": 0, "counted_as_zero": 0}
-    iqm, interval = iqm_ci95([_runs(rows, "score") if rows else [np.zeros(1)] for rows in scored])
+    iqm, interval = iqm_ci95([_scores(spec, rows) for spec, rows in scored])
     return {
         "score_iqm": iqm, "score_iqm_ci95": list(interval), "tasks": len(scored), "counted_as_zero": missing,
     }  # fmt: skip
 
 
-def _runs(rows: Sequence[Row], name: str) -> Runs:
-    """One quantity of every episode, an array per training seed."""
-    seeds = sorted({row["train_seed"] for row in rows})
-    return [np.array([row[name] for row in rows if row["train_seed"] == seed]) for seed in seeds]
+def _scores(spec: TaskSpec, rows: Sequence[Row]) -> Runs:
+    """Scores of every episode, an array per training seed."""
+    if not rows:
+        return [np.zeros(1)]
+    return [np.array([spec.score(value) for value in _returns(spec, run)]) for run in _by_seed(rows).values()]
+
+
+def _returns(spec: TaskSpec, run: Sequence[Row]) -> np.ndarray:
+    """What a run's episodes count: after a DNF the floor, whatever they reached."""
+    return np.array([spec.floor if _dnf(run) else row["return"] for row in run])
+
+
+def _dnf(run: Sequence[Row]) -> bool:
+    """Whether too many of a run's episodes failed."""
+    return sum(row["status"] != OK for row in run) >= failures_of_a_dnf(len(run))
+
+
+def _run(spec: TaskSpec, train_seed: int, run: Sequence[Row]) -> dict[str, Any]:
+    """What one trained policy reached."""
+    mean = float(_returns(spec, run).mean())
+    return {
+        "train_seed": train_seed,
+        "return_mean": mean,
+        "score": spec.score(mean) if spec.anchors else None,
+        "dnf": _dnf(run),
+    }
+
+
+def _by_seed(rows: Sequence[Row]) -> dict[int, list[Row]]:
+    """Rows of each training seed."""
+    runs: dict[int, list[Row]] = {}
+    for row in rows:
+        runs.setdefault(row["train_seed"], []).append(row)
+    return dict(sorted(runs.items()))
+
+
+def _by_deaths(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Mean return of the episodes in which so many agents died."""
+    returns: dict[int, list[float]] = {}
+    for row in rows:
+        returns.setdefault(row["deaths"], []).append(row["return"])
+    return [
+        {"deaths": deaths, "episodes": len(values), "return_mean": float(np.mean(values))}
+        for deaths, values in sorted(returns.items())
+    ]
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

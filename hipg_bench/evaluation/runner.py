@@ -21,9 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from hipg_bench.errors import BundleError, ResumeError
-from hipg_bench.evaluation import films, report
+from hipg_bench.evaluation import films, report, splits
 from hipg_bench.evaluation.episodes import Plan, Row, versions
+from hipg_bench.evaluation.failures import NOT_PLAYED, close
+from hipg_bench.evaluation.latency import Stopwatch
 from hipg_bench.evaluation.results import SCHEMA, aggregate, summarise
+from hipg_bench.evaluation.seeds import commitment
 from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.spec import TaskSpec
@@ -59,7 +62,7 @@ def playable(agent: Agent, suite: Suite) -> tuple[dict[str, tuple[int, ...]], di
             continue
         try:
             for train_seed in found:
-                agent.policy(spec, train_seed)
+                close(agent.policy(spec, train_seed))
             seeds[spec.task] = found
         except BundleError as error:
             skipped[spec.task] = str(error)
@@ -92,35 +95,41 @@ def evaluate(
         ResumeError: ``out`` belongs to another evaluation.
     """
     seeds, skipped = playable(agent, suite)
-    _claim(out, {"agent": agent.name, "seed": plan.seed, "versions": versions()})
-    timing: dict[str, float] = {}
+    specs = [splits.with_anchors(plan.split, spec) for spec in suite.specs]
+    worlds = {"seed": plan.seed} if plan.salt is None else {"commitment": commitment(plan.salt)}
+    _claim(out, {"agent": agent.name, "split": plan.split, **worlds, "versions": versions()})
+    seconds: dict[str, float] = {}
+    watches: dict[str, Stopwatch] = {}
     rows: dict[str, list[Row]] = {}
-    for spec in suite.specs:
+    for spec in specs:
         if spec.task in seeds:
-            with _timed(timing, spec.task):
-                rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, progress)
-    played = [spec for spec in suite.specs if spec.task in rows]
-    with _timed(timing, "films"):
-        chosen = [
-            one
-            for spec in played
-            for one in films.choose(agent, spec, rows[spec.task], plan, films_per_task, out)
-        ]
-        made, trouble = films.make(chosen, lambda done: progress("films", done))
+            watches[spec.task] = watch = Stopwatch()
+            with _timed(seconds, spec.task):
+                rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, watch, progress)
+    played = [spec for spec in specs if spec.task in rows]
+    with _timed(seconds, "films"):
+        chosen, trouble = films.choose_all(agent, played, rows, plan, films_per_task, out)
+        made, more_trouble = films.make(chosen, lambda done: progress("films", done))
     results = {
         "schema": SCHEMA,
         "suite": suite.name,
+        "split": plan.split,
         "agent": agent.name,
         "agent_summary": agent.summary,
-        "seed": plan.seed,
+        "seed": None,
+        "commitment": None,
+        **worlds,
         "episodes_per_policy": plan.episodes,
         "versions": versions(),
-        "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in suite.specs]),
+        "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in specs]),
         "tasks": [summarise(spec, rows[spec.task]) for spec in played],
         "skipped": [{"task": task, "reason": reason} for task, reason in skipped.items()],
         "films": [{"task": one.spec.task, "file": one.file, "title": one.title} for one in made],
-        "film_trouble": trouble,
-        "seconds": timing,
+        "film_trouble": [*trouble, *more_trouble],
+        "timing": {
+            "seconds": seconds,
+            "act_ms": {task: watch.summary() for task, watch in watches.items()},
+        },
     }
     write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
     write_text(out / "report.html", report.render(results, rows, {spec.task: spec for spec in played}))
@@ -136,7 +145,13 @@ def _timed(seconds: dict[str, float], name: str) -> Generator[None]:
 
 
 def _play_task(
-    agent: Agent, spec: TaskSpec, train_seeds: Sequence[int], out: Path, plan: Plan, progress: Progress
+    agent: Agent,
+    spec: TaskSpec,
+    train_seeds: Sequence[int],
+    out: Path,
+    plan: Plan,
+    watch: Stopwatch,
+    progress: Progress,
 ) -> list[Row]:
     """Play what is missing of one task; the file is whole after every batch."""
     path = out / "episodes" / f"{spec.task}.jsonl"
@@ -150,10 +165,9 @@ def _play_task(
     rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, identity, plan)}
     progress(spec.task, len(rows))
     for train_seed in train_seeds:
-        policy = agent.policy(spec, train_seed)
-        done = [world for seed, world in rows if seed == train_seed]
-        for worlds in plan.batches(done):
-            played = plan.play(spec, policy, worlds, lambda more: progress(spec.task, more))
+        policy = watch.timed(agent.policy(spec, train_seed))
+        done = [row for (seed, _), row in rows.items() if seed == train_seed]
+        for played in plan.rows(spec, policy, done, lambda more: progress(spec.task, more)):
             rows |= {(train_seed, row["world"]): identity[train_seed] | row for row in played}
             _write_rows(path, rows)
     return [rows[key] for key in sorted(rows)]
@@ -176,13 +190,15 @@ def _resumed(path: Path, identity: Mapping[int, Row], plan: Plan) -> list[Row]:
         expected = identity.get(row["train_seed"])
         if expected is None:
             raise _foreign(path, "train_seed", row["train_seed"], list(identity))
-        expected = expected | {"eval_seed": plan.eval_seed(row["world"])}
+        seed = plan.told_seed(row["task"], row["world"])
+        expected = expected | {"eval_seed": seed, "split": plan.split}
         for name, value in expected.items():
             if row[name] != value:
                 raise _foreign(path, name, row[name], value)
         if row["world"] >= plan.episodes:
             raise _foreign(path, "world", row["world"], f"below {plan.episodes}")
-    return rows
+    # a longer evaluation may still be finished
+    return [row for row in rows if row["status"] != NOT_PLAYED]
 
 
 def _claim(out: Path, run: dict[str, Any]) -> None:

@@ -52,7 +52,7 @@ def scoring_time(agent: str, specs: tuple[TaskSpec, ...], episodes: int, threads
         results = evaluate(who, Suite("bench", specs), Path(folder), Plan(episodes=episodes, threads=threads))
     whole = time.perf_counter() - started
     played = {task["task"]: task["episodes"] for task in results["tasks"]}
-    taken = [(task, count, results["seconds"][task]) for task, count in played.items()]
+    taken = [(task, count, results["timing"]["seconds"][task]) for task, count in played.items()]
     return [
         Scoring(agent, task, threads, count, seconds, count / seconds)
         for task, count, seconds in [*taken, ("all", sum(played.values()), whole)]
