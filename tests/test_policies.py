@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from safetensors.numpy import save_file
 from scipy import stats
 
 from hipg_bench import make, task_spec
 from hipg_bench.errors import BundleError, UnknownNameError
 from hipg_bench.policies.bundle import agents, load_agent
-from hipg_bench.policies.network import Form, load_network, save_network
+from hipg_bench.policies.network import save_network
 from hipg_bench.policies.simple import Constant, Random, TimeOnly, Zero
 
 N, A = 4, 3
@@ -223,127 +222,3 @@ def test_a_film_takes_the_first_training_whatever_its_seed() -> None:
     assert _policy(who, spec, None).action_size == 3
     with pytest.raises(BundleError):
         _policy(who, spec, 0)
-
-
-LAYERS = {"layer0.weight": (6, 5), "layer0.bias": (6,), "layer1.weight": (4, 6), "layer1.bias": (4,)}
-
-
-def tensors(lead=(), **changed):
-    """A network from 5 observed numbers to 4 outputs; ``lead`` is (N,) for weights per agent."""
-    chance = np.random.default_rng(3)
-    shapes = {name: (*lead, *shape) for name, shape in LAYERS.items()} | changed
-    return {
-        "observation.mean": chance.normal(size=5),
-        "observation.scale": chance.uniform(0.5, 2, size=5),
-        **{name: chance.normal(size=shape) for name, shape in shapes.items()},
-    }
-
-
-def by_hand(content, form, observation, agent):
-    """One agent's action, layer by layer."""
-    own = {name: array.astype(np.float32).astype(np.float64) for name, array in content.items()}
-    if own["layer0.bias"].ndim == 2:
-        own = {name: array[agent] if name.startswith("layer") else array for name, array in own.items()}
-    seen = np.clip((observation - own["observation.mean"]) / own["observation.scale"], -10, 10)
-    hidden = own["layer0.weight"] @ seen + own["layer0.bias"]
-    hidden = np.tanh(hidden) if form.activation == "tanh" else np.maximum(hidden, 0)
-    out = own["layer1.weight"] @ hidden + own["layer1.bias"]
-    if form.head == "bins":
-        places = [int(np.argmax(out[start : start + form.bins])) for start in range(0, 4, form.bins)]
-        return form.reach * np.array([np.linspace(-1, 1, form.bins)[place] for place in places])
-    return form.reach * (np.tanh(out) if form.head == "tanh" else np.clip(out, -1, 1))
-
-
-FORMS = [
-    Form(),
-    Form(activation="relu", head="tanh", reach=5.0),
-    Form(activation="relu", head="bins", bins=2),
-    Form(activation="relu", head="bins", bins=4),
-]
-
-
-@pytest.mark.parametrize("lead", [(), (3,)], ids=["shared", "apart"])
-@pytest.mark.parametrize("form", FORMS, ids=str)
-def test_a_policy_file_acts_as_it_declares(tmp_path, form, lead):
-    content = tensors(lead)
-    save_network(content, tmp_path / "one.safetensors", form)
-    policy = load_network(tmp_path / "one.safetensors")
-    observation = np.random.default_rng(4).normal(0, 3, size=(6, 3, 5)).astype(np.float32)
-    assert policy.initial_state(0, np.arange(6), 3) is None
-    action, _ = policy.act(observation, None, np.ones((6, 3), bool))
-    expected = np.array([[by_hand(content, form, seen[i], i) for i in range(3)] for seen in observation])
-    assert policy.action_size == expected.shape[-1]
-    np.testing.assert_allclose(action, expected, atol=1e-5)
-    assert (action * 2**16 == np.round(action * 2**16)).all()
-    alone, _ = policy.act(observation[2:3], None, np.ones((1, 3), bool))
-    np.testing.assert_array_equal(alone, action[2:3])
-
-
-def test_equal_values_take_the_first_bin(tmp_path):
-    content = tensors() | {"layer1.weight": np.zeros((4, 6)), "layer1.bias": np.full(4, 0.3)}
-    save_network(content, tmp_path / "one.safetensors", Form(head="bins", bins=4))
-    policy = load_network(tmp_path / "one.safetensors")
-    action, _ = policy.act(np.ones((1, 1, 5), np.float32), None, np.ones((1, 1), bool))
-    assert action.tolist() == [[[-1.0]]]
-
-
-def test_the_same_network_is_the_same_file(tmp_path):
-    for name in ("a", "b"):
-        save_network(tensors(), tmp_path / name, FORMS[1])
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
-def test_a_file_of_the_first_format_is_a_shared_tanh_network(tmp_path):
-    content = {name: array.astype(np.float32) for name, array in tensors().items()}
-    save_file(content, tmp_path / "old.safetensors", {"format": "hipg-mlp-1"})
-    policy = load_network(tmp_path / "old.safetensors")
-    assert policy.form == Form()
-    action, _ = policy.act(np.ones((1, 1, 5), np.float32), None, np.ones((1, 1), bool))
-    np.testing.assert_allclose(action[0, 0], by_hand(content, Form(), np.ones(5), 0), atol=1e-5)
-
-
-def test_weights_of_three_agents_are_not_a_team_of_four(tmp_path):
-    save_network(tensors((3,)), tmp_path / "one.safetensors")
-    with pytest.raises(BundleError, match="weights for 3 agents, the task 4"):
-        load_network(tmp_path / "one.safetensors").initial_state(0, np.arange(2), 4)
-
-
-@pytest.mark.parametrize(
-    ("declared", "changed", "reason"),
-    [
-        ("hipg-mlp-3 {}", {}, "'hipg-mlp-1' and 'hipg-mlp-2' are allowed, got 'hipg-mlp-3'"),
-        ("", {}, "are allowed, got ''"),
-        ("hipg-mlp-2", {}, "its form '' is refused"),
-        ("hipg-mlp-2 []", {}, "its form '[]' is refused"),
-        ('hipg-mlp-2 {"activation": "gelu"}', {}, "activation = 'gelu' is refused"),
-        ('hipg-mlp-2 {"activaton": "relu"}', {}, "no field 'activaton'; did you mean 'activation'?"),
-        ('hipg-mlp-2 {"head": "bins"}', {}, "2 or more bins belong to the head 'bins', got 0"),
-        ('hipg-mlp-2 {"bins": 4}', {}, "got 4, 'mean'"),
-        ('hipg-mlp-2 {"head": "bins", "bins": 3}', {}, "4 outputs are not a multiple of 3 bins"),
-        ('hipg-mlp-2 {"reach": 0}', {}, "reach = 0"),
-        (
-            "hipg-mlp-2 {}",
-            {"layer1.weight": (3, 4, 6)},
-            "layer1 is (3, 4, 6), (4,); expected (out, 6), (out,)",
-        ),
-        (
-            "hipg-mlp-2 {}",
-            {"layer0.weight": (3, 6, 5), "layer0.bias": (3, 6)},
-            "expected (3, out, 6), (3, out,)",
-        ),
-        (
-            "hipg-mlp-2 {}",
-            {"layer0.weight": (2, 3, 6, 5), "layer0.bias": (2, 3, 6)},
-            "layer0 is (2, 3, 6, 5)",
-        ),
-        ("hipg-mlp-2 {}", {"layer1.weight": (0, 6), "layer1.bias": (0,)}, "layer1 is (0, 6)"),
-        ("hipg-mlp-2 {}", {"layer1.weight": (6,), "layer1.bias": ()}, "layer1 is (6,), ()"),
-        ("hipg-mlp-2 {}", {"layer2.weight": (4, 4)}, "tensors"),
-    ],
-)
-def test_malformed_policy_files_are_refused(tmp_path, declared, changed, reason):
-    content = {name: np.asarray(array, np.float32) for name, array in tensors(**changed).items()}
-    save_file(content, tmp_path / "one.safetensors", {"format": declared})
-    with pytest.raises(BundleError) as caught:
-        load_network(tmp_path / "one.safetensors")
-    assert reason in str(caught.value)

@@ -17,6 +17,7 @@ from pathlib import Path
 from hipg_bench import registry
 from hipg_bench.errors import BundleError, HipgError, UnknownNameError, hint
 from hipg_bench.paths import data_folder
+from hipg_bench.policies.attention import Attention
 from hipg_bench.policies.card import Card, read_card
 from hipg_bench.policies.network import load_network
 from hipg_bench.policies.policy import Policy
@@ -125,6 +126,12 @@ class Agent:
             raise BundleError(
                 f"agent {self.name!r}: {spec.task} has (O, A) = {expected}, its network {sizes}: train again"
             )
+        blocks = tuple((block.name, block.shape) for block in layout.observation.blocks)
+        if isinstance(network, Attention) and network.form.observation != blocks:
+            raise BundleError(
+                f"agent {self.name!r}: {spec.task} shows the blocks {_listed(blocks)}, "
+                f"its network declares {_listed(network.form.observation)}"
+            )
         return network
 
     @property
@@ -188,6 +195,10 @@ def digests(folder: Path) -> dict[str, str]:
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
     }
+
+
+def _listed(blocks: tuple[tuple[str, tuple[int, ...]], ...]) -> str:
+    return ", ".join(f"{name} {shape}" for name, shape in blocks)
 
 
 def _read(folder: Path, trust: bool) -> Agent:
