@@ -17,6 +17,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 from hipg_bench.rendering import gl
+from hipg_bench.sandbox import choice
 
 Level = Literal["ok", "note", "warning", "broken"]
 """``warning``: something does not work, but scores do. ``broken``: nothing will work."""
@@ -44,6 +45,7 @@ _SPARE_DISK = 2e9
 _SLOW = 2_000
 """Environment steps per second below which an evaluation takes long."""
 _SPEED_TASK, _SPEED_ENVS, _SPEED_SECONDS = "hazard_nav-4", 256, 1.0
+_SANDBOX_MENDS = {"bubblewrap": "apt install bubblewrap"}
 _GL_NAMES = ("egl", "osmesa", "glfw", "")
 
 
@@ -60,6 +62,7 @@ def examine(told: Callable[[Finding], None] = lambda finding: None) -> list[Find
         _cores,
         _disk,
         _data,
+        _sandbox,
         _speed,
     ):
         for finding in look():
@@ -230,6 +233,19 @@ def _data() -> Iterator[Finding]:
         yield Finding("agents", "ok", ", ".join(bundle.agents()))
     except Exception as error:
         yield _failure("tasks", error)
+
+
+def _sandbox() -> Iterator[Finding]:
+    """What each way to lock agents of others in refuses, by trying."""
+    trials = choice.trials()
+    works = any(trial.works for trial in trials.values())
+    for name, trial in trials.items():
+        text = f"{trial} ({trial.seconds:.1f} s)"
+        if trial.works:
+            yield Finding(f"sandbox {name}", "ok", text)
+        else:
+            level: Level = "note" if works else "warning"
+            yield Finding(f"sandbox {name}", level, text, _SANDBOX_MENDS.get(name, ""))
 
 
 def _speed() -> Iterator[Finding]:

@@ -166,8 +166,7 @@ def _action(
     """
     said = header.get("shape")
     if said != list(shape) or payload.nbytes != 8 * int(np.prod(shape)):
-        kind = f"{header.get('kind')!s:.50}"
-        got = f"shape {said}" if isinstance(said, list) else f"{kind}, which is no array of numbers"
+        got = f"shape {said}" if said else f"{header.get('kind')}, which is no array of numbers"
         raise AgentFailure("wrong_shape", f"actions have shape {list(shape)} (B, N, A), got {got:.100}")
     return np.frombuffer(payload, np.float64).reshape(shape).copy()
 

@@ -51,8 +51,7 @@ def main() -> None:
     except EOFError:
         return
     except BaseException as error:  # SystemExit of the agent, too, is a crash
-        traceback.print_exc()
-        sys.stderr.flush()
+        _print(error)
         wire.send(target, {"error": f"{type(error).__name__}: {error}"[:500]})
 
 
@@ -74,8 +73,18 @@ def _answer(setup: Mapping[str, Any], source: int, target: int) -> None:
         alive = np.frombuffer(payload, np.bool_, offset=seen.nbytes).reshape(worlds, agents)
         answer = agent.act(seen, alive)
         try:
-            action = np.ascontiguousarray(answer, np.float64)
+            action = np.asarray(answer, np.float64)
         except (TypeError, ValueError):  # no rectangle of numbers
-            wire.send(target, {"shape": None, "kind": type(answer).__name__})
-            continue
-        wire.send(target, {"shape": np.shape(action) if np.ndim(answer) else []}, action.tobytes())
+            action = np.empty(())
+        said = {"shape": action.shape} if action.ndim else {"kind": type(answer).__name__[:50]}
+        wire.send(target, said, action.tobytes())
+
+
+def _print(error: BaseException) -> None:
+    """Print a traceback that begins in the agent's code."""
+    place = error.__traceback__
+    ours = (os.path.dirname(__file__), os.path.dirname(importlib.__file__), "<frozen importlib")
+    while place is not None and place.tb_frame.f_code.co_filename.startswith(ours):
+        place = place.tb_next
+    traceback.print_exception(type(error), error, place)
+    sys.stderr.flush()
