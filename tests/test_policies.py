@@ -1,5 +1,7 @@
 """Blind policies are pure and independent of the batch; bundles are data and are refused with a reason."""
 
+import os
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -167,6 +169,29 @@ def test_a_python_card_names_its_tasks_and_its_files_make_its_fingerprint(tmp_pa
     assert len(prints) == 2
     with pytest.raises(BundleError, match="no training seed 0 for hazard_nav-4"):
         agent.fingerprint("hazard_nav-4", 0)
+
+
+def test_a_python_agent_plays_in_its_own_process(tmp_path):
+    folder = bundle(tmp_path / "coded", PYTHON.replace("team.agent", "agent"))
+    (folder / "agent.py").write_text(
+        "import os, numpy as np\n"
+        "class Agent:\n"
+        "    def __init__(self, task, seed): self.task, self.seed = task, seed\n"
+        "    def reset(self, seeds): pass\n"
+        "    def act(self, observation, alive):\n"
+        "        answer = np.zeros((*alive.shape, self.task['action_size']))\n"
+        "        answer[..., 0], answer[..., 1] = self.seed / 8, os.getpid() == PARENT\n"
+        "        return answer\n"
+        "make_agent = Agent\n".replace("PARENT", str(os.getpid()))
+    )
+    policy = load_agent(folder).policy(task_spec("hazard_nav-4"), 3)
+    seen, alive = np.zeros((2, 4, policy_size("hazard_nav-4")), np.float32), np.ones((2, 4), bool)
+    action, _ = policy.act(seen, policy.initial_state(0, np.arange(2), 4), alive)
+    assert action[1, 2].tolist() == [0.375, 0.0, 0.0]
+
+
+def policy_size(task):
+    return make(task).layout.observation.size
 
 
 def weights(o, a, scale=1.0):

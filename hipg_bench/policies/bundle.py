@@ -19,6 +19,8 @@ from hipg_bench.errors import BundleError, HipgError, UnknownNameError, hint
 from hipg_bench.paths import data_folder
 from hipg_bench.policies.attention import Attention
 from hipg_bench.policies.card import Card, read_card
+from hipg_bench.policies.foreign import ForeignPolicy
+from hipg_bench.policies.graph import check_graph
 from hipg_bench.policies.network import load_network
 from hipg_bench.policies.policy import Policy
 from hipg_bench.policies.scripted import Scripted
@@ -88,14 +90,18 @@ class Agent:
 
         Raises:
             BundleError: it has none for the task or training seed, or the weights do not fit.
+            SandboxError: it needs a sandbox, and none works here.
         """
         match self.card.kind:
             case "builtin":
                 return self._builtin(spec)
             case "network":
                 return self._network(spec, train_seed)
-            case _:
-                raise BundleError(f"agent {self.name!r}: kind {self.card.kind!r} cannot be played yet")
+            case "onnx":
+                return self._graph(spec, train_seed)
+            case "python":
+                self._check_trained(spec.task, train_seed)
+                return self._foreign(spec, train_seed, "python_runner", entry_point=self.card.entry_point)
 
     def fingerprint(self, task: str, train_seed: int = 0) -> str:
         """Twelve hex digits that tell one policy of this agent from another."""
@@ -133,6 +139,15 @@ class Agent:
                 f"its network declares {_listed(network.form.observation)}"
             )
         return network
+
+    def _graph(self, spec: TaskSpec, train_seed: int) -> Policy:
+        path, layout = self._weights(spec.task, train_seed), registry.family_of(spec).layout
+        check_graph(path, layout.observation.size, layout.action.size)
+        return self._foreign(spec, train_seed, "onnx_runner", file=path.relative_to(self.folder).as_posix())
+
+    def _foreign(self, spec: TaskSpec, train_seed: int, runner: str, **options: str | None) -> Policy:
+        """A policy that acts in a process of its own."""
+        return ForeignPolicy(spec, self.folder, train_seed, runner=runner, options=options, trust=self.trust)
 
     @property
     def _ending(self) -> str:
