@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import time
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,7 @@ class ForeignPolicy:
         self.sandbox = choice.NONE if trust else choice.sandbox()
         self._folder = folder
         self._budget = budget
+        self._children: weakref.WeakSet[Child] = weakref.WeakSet()
         layout = registry.family_of(spec).layout
         self._action_size = layout.action.size
         self._setup = {
@@ -109,7 +111,13 @@ class ForeignPolicy:
         child = Child(choice.BACKENDS[self.sandbox], self._folder, self._setup, self._budget)
         left = self._budget.start_up - (time.monotonic() - started)
         child.ask({"do": "reset"}, [agent_seeds(seed, episode_id).tobytes()], left)
+        self._children.add(child)
         return Session(child, self._budget.bank)
+
+    def close(self) -> None:
+        """End the children that still run; `initial_state` starts another."""
+        for child in self._children:
+            child.kill()
 
     def act(
         self, observation: Float[np.ndarray, "B N O"], memory: Session, alive: Bool[np.ndarray, "B N"]
