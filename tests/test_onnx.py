@@ -1,4 +1,4 @@
-"""ONNX agents act as the graph does, one agent at a time in a sandbox; graphs that can do more are refused."""
+"""ONNX agents act as the graph does, one agent at a time in a sandbox; those that can do more are refused."""
 
 import warnings
 

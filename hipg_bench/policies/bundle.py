@@ -110,10 +110,13 @@ class Agent:
                 content = str(self.card.builtin).encode()
             case "python":
                 self._check_trained(task, train_seed)
-                content = json.dumps([task, train_seed, digests(self.folder)]).encode()
+                content = json.dumps([task, train_seed, self._digests()]).encode()
             case _:
                 content = self._weights(task, train_seed).read_bytes()
         return hashlib.sha256(content).hexdigest()[:12]
+
+    def _digests(self) -> dict[str, str]:
+        return {name: digest(path) for name, path in bundle_files(self.folder).items()}
 
     def _builtin(self, spec: TaskSpec) -> Policy:
         try:
@@ -204,12 +207,28 @@ def load_agent(name_or_path: str | Path, *, trust: bool = False) -> Agent:
     raise UnknownNameError(f"no agent {str(name_or_path)!r}{hint(str(name_or_path), agents())}")
 
 
-def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below a folder, by its path in it, in the order of names."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
-    }
+def bundle_files(folder: Path) -> dict[str, Path]:
+    """The files that belong to a bundle, by their path in it, in order; hidden ones and caches do not.
+
+    Raises:
+        BundleError: something is neither a file nor a folder, such as a link.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        inside = path.relative_to(folder)
+        if any(part.startswith(".") or part == "__pycache__" for part in inside.parts):
+            continue
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            raise BundleError(f"{path}: links and devices are not allowed, only files and folders")
+        if path.is_file():
+            found[inside.as_posix()] = path
+    return found
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _listed(blocks: tuple[tuple[str, tuple[int, ...]], ...]) -> str:

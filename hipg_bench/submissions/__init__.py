@@ -1,0 +1,1 @@
+"""Submissions: agent bundles on their way from who trained them to the leaderboard."""
