@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from hipg_bench.cli import agents, audit, bench, calibrate, doctor, evaluate, media, tasks, train
+from hipg_bench.cli import agents, audit, bench, calibrate, collect, doctor, evaluate, media, tasks, train
 from hipg_bench.errors import HipgError
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ app = typer.Typer(
 )
 app.command()(evaluate.evaluate)
 app.command()(train.train)
+app.command()(collect.collect)
 app.command()(media.video)
 app.command()(media.view)
 app.add_typer(tasks.app, name="tasks")

@@ -161,7 +161,7 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
         "agent_steps": steps * spec.num_agents,
         "seconds": seconds,
         "threads": torch.get_num_threads(),
-        "machine": platform.processor() or platform.machine(),
+        "machine": _processor(),
         "versions": {
             "mujoco": mujoco.__version__,
             "torch": torch.__version__,
@@ -171,3 +171,11 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
     if isinstance(settings, MaddpgSettings | QmixSettings):
         content["versions"]["torchrl"] = metadata.version("torchrl")
     return json.dumps(content, indent=2) + "\n"
+
+
+def _processor() -> str:
+    """The model's name; the standard library does not know it on Linux."""
+    described = Path("/proc/cpuinfo")
+    lines = described.read_text().splitlines() if described.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,1 @@
+"""The paper's comparison from finished runs: artefacts, curves, figures and verdicts."""
