@@ -2,6 +2,7 @@
 
 import functools
 import textwrap
+from pathlib import Path
 
 import numpy as np
 
@@ -49,3 +50,12 @@ def step(agent, worlds=2, seed=5, steps=1, alive=None, spec=TASK):
     for _ in range(steps):
         action, session = act(session, alive)
     return action, session
+
+
+def descendants(pid):
+    """Its children, and theirs."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in (task / "children").read_text().split():
+            found += [int(child), *descendants(int(child))]
+    return found

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign import WORKING
+from foreign import WORKING, descendants
 
 from hipg_bench.errors import AgentFailure, HostFailure, SandboxError
 from hipg_bench.sandbox import bubblewrap, choice, landlock, probe
@@ -205,7 +205,7 @@ def test_children_are_gone_when_they_are_dropped_and_when_their_parent_is_killed
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     child = int(parent.stdout.readline())
-    family = _descendants(parent.pid)
+    family = descendants(parent.pid)
     assert child in family
     parent.send_signal(signal.SIGKILL)
     parent.wait()
@@ -213,15 +213,6 @@ def test_children_are_gone_when_they_are_dropped_and_when_their_parent_is_killed
     while any(_alive(pid) for pid in family) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert [pid for pid in family if _alive(pid)] == []
-
-
-def _descendants(pid):
-    """Its children, and theirs."""
-    found = []
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        for child in (task / "children").read_text().split():
-            found += [int(child), *_descendants(int(child))]
-    return found
 
 
 def _alive(pid):
