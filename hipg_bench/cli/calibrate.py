@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -9,11 +10,17 @@ import typer
 from hipg_bench.cli import console
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from hipg_bench.evaluation.calibration import Calibration
+    from hipg_bench.spec import TaskSpec
 
 
 def calibrate(
     task: Annotated[str, typer.Argument(help="The task's name.")],
+    split: Annotated[
+        str, typer.Option(help="Or only the anchors in: shift, forced_death, ad_hoc.")
+    ] = "standard",
     episodes: Annotated[int, typer.Option(min=1, help="Per measured policy.")] = 1000,
     threads: Annotated[int, typer.Option(min=0, help="Physics threads, 0 for all cores.")] = 0,
     write: Annotated[bool, typer.Option("--write", help="Freeze the numbers in the task file.")] = False,
@@ -25,14 +32,11 @@ def calibrate(
     from hipg_bench.paths import data_folder
 
     spec = registry.task_spec(task)
+    if split != "standard":
+        _calibrate_split(spec, split, episodes, threads, write, as_json)
+        return
     with console.progress() as bars:
-        ids: dict[str, int] = {}
-
-        def progress(name: str, done: float) -> None:
-            if name not in ids:
-                ids[name] = bars.add_task(name, total=episodes)
-            bars.advance(bars.task_ids[ids[name]], done)
-
+        progress = _advance(bars, episodes)
         measured = calibration.calibrate(spec, episodes, threads=threads, progress=progress)
     if write:
         calibration.write(measured.spec, data_folder("tasks") / f"{task}.toml")
@@ -41,6 +45,40 @@ def calibrate(
         console.show_json(facts | {"fingerprint": spec.fingerprint, "scores": dict(measured.scores)})
     else:
         _print(measured)
+
+
+def _calibrate_split(
+    spec: TaskSpec, split: str, episodes: int, threads: int, write: bool, as_json: bool
+) -> None:
+    """Measure a task's anchors in a split."""
+    from hipg_bench.evaluation import calibration
+
+    with console.progress() as bars:
+        progress = _advance(bars, episodes)
+        anchors = calibration.anchors_in(split, spec, episodes, threads=threads, progress=progress)
+    if write:
+        calibration.write_anchors(split, spec.task, anchors)
+    if as_json:
+        console.show_json({"task": spec.task, "split": split, "anchors": anchors.model_dump(mode="json")})
+        return
+    console.say(f"[bold]{spec.task}[/bold] in {split}\n")
+    rows = console.table("what", ">value", "95 %", "")
+    for name, anchor in (("random", anchors.random), ("reference", anchors.reference)):
+        note = f"{anchor.episodes} episodes" if anchor.episodes else anchors.reference_is
+        rows.add_row(f"return, {name}", f"{anchor.mean:.2f}", console.interval(anchor.ci95), note)
+    console.show(rows)
+
+
+def _advance(bars: Progress, episodes: int) -> Callable[[str, float], None]:
+    """A bar for each name that is told."""
+    ids: dict[str, TaskID] = {}
+
+    def progress(name: str, done: float) -> None:
+        if name not in ids:
+            ids[name] = bars.add_task(name, total=episodes)
+        bars.advance(ids[name], done)
+
+    return progress
 
 
 def _print(measured: Calibration) -> None:

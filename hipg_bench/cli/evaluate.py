@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +12,9 @@ import typer
 from hipg_bench.cli import console
 
 if TYPE_CHECKING:
+    from hipg_bench.evaluation.episodes import Plan
     from hipg_bench.evaluation.runner import Suite
+    from hipg_bench.policies.bundle import Agent
 
 _QUICK = 32
 
@@ -22,6 +25,9 @@ def evaluate(
     ] = "mappo_minhealth",
     tasks: Annotated[
         str, typer.Option(help="Task names with commas between, or: standard, paper, all.")
+    ] = "standard",
+    split: Annotated[
+        str, typer.Option(help="standard, shift, forced_death, ad_hoc, or all, a folder for each.")
     ] = "standard",
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and training seed.")] = 320,
     seed: Annotated[int, typer.Option(min=0, help="Evaluation seed of the first 64 worlds.")] = 1000,
@@ -41,7 +47,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
 ) -> None:
     """Score an agent on tasks, with films and a report."""
-    from hipg_bench.evaluation import runner
+    from hipg_bench.evaluation import splits
     from hipg_bench.evaluation.episodes import Plan
     from hipg_bench.policies.bundle import load_agent
 
@@ -49,20 +55,30 @@ def evaluate(
     plan = Plan(seed, _QUICK if quick else episodes, num_envs, threads)
     films = (0 if quick else 1) if video is None else video
     folder = out or Path("runs") / f"{who.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    seeds, _ = runner.playable(who, suite)
+    parts = {name: folder / name for name in splits.SPLITS} if split == "all" else {split: folder}
+    every: dict[str, Any] = {}
+    for name, part in parts.items():
+        every[name] = _evaluate(who, suite, part, dataclasses.replace(plan, split=name), films)
+        if not as_json:
+            _print(every[name], part)
+    if as_json:
+        console.show_json(every if split == "all" else every[split])
+
+
+def _evaluate(who: Agent, suite: Suite, folder: Path, plan: Plan, films: int) -> dict[str, Any]:
+    """One split, with a bar for each task."""
+    from hipg_bench.evaluation import runner
+
+    seeds, _ = runner.playable(who, suite, plan.split)
     with console.progress() as bars:
         totals = {task: plan.episodes * len(found) for task, found in seeds.items()}
         if films:
             totals["films"] = films * len(seeds)
         ids = {name: bars.add_task(name, total=total) for name, total in totals.items()}
-        results = runner.evaluate(
+        return runner.evaluate(
             who, suite, folder, plan, films_per_task=films,
             progress=lambda stage, done: bars.advance(ids[stage], done) if stage in ids else None,
         )  # fmt: skip
-    if as_json:
-        console.show_json(results)
-    else:
-        _print(results, folder)
 
 
 def suite_of(tasks: str) -> Suite:
@@ -91,7 +107,8 @@ def _print(results: dict[str, Any], folder: Path) -> None:
         )  # fmt: skip
     for task in results["skipped"]:
         rows.add_row(task["task"], "-", "", "-", "-", "-", f"[dim]{task['reason']}[/dim]")
-    console.say(f"[bold]{results['agent']}[/bold] on {results['suite']}: {results['agent_summary']}\n")
+    what = f"{results['suite']}, {results['split']}"
+    console.say(f"[bold]{results['agent']}[/bold] on {what}: {results['agent_summary']}\n")
     console.show(rows)
     whole = results["aggregate"]
     if whole["score_iqm"] is not None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from hipg_bench import registry
 from hipg_bench.errors import SpecError
+from hipg_bench.evaluation import splits
 from hipg_bench.evaluation.episodes import Plan, Row
 from hipg_bench.evaluation.statistics import mean_ci95
 from hipg_bench.paths import write_text
@@ -97,6 +98,39 @@ def calibrate(spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Prog
     return Calibration(scale.model_copy(update={"calibration": rounded}), scores)
 
 
+def anchors_in(split: str, spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Progress) -> Anchors:
+    """Measure a task's anchors under the rules of a split.
+
+    The reference knows what the split changed: it is made for each variant anew.
+
+    Raises:
+        UnknownNameError: no such split, or it has no rules for the task's family.
+    """
+    plan = Plan(_SEED, episodes, threads=threads, split=split)
+    size = registry.family_of(spec).layout.action.size
+    random = plan.play_all(spec, Random(size), lambda done: progress("random", done))
+    stated = _stated(spec)
+    if stated:
+        return Anchors(random=_anchor(random), reference=stated[0], reference_is=stated[1])
+    rows: list[Row] = []
+    for worlds in plan.batches():
+        expert = Scripted(plan.spec(spec, worlds[0]))
+        rows += plan.play(spec, expert, worlds, lambda done: progress("scripted", done))
+    return Anchors(random=_anchor(random), reference=_anchor(rows))
+
+
+def write_anchors(split: str, task: str, anchors: Anchors) -> None:
+    """Put a task's anchors in a split beside those of the other tasks."""
+    known = {name: dict(tasks) for name, tasks in splits.anchors().items()}
+    known.setdefault(split, {})[task] = anchors
+    lines = ["# Measured by `hipg-bench calibrate TASK --split SPLIT --episodes 1280 --write`."]
+    for name in sorted(known):
+        for measured in sorted(known[name]):
+            lines += ["", f'[{name}."{measured}"]', *_lines(known[name][measured])]
+    write_text(splits.folder() / "anchors.toml", "\n".join(lines) + "\n")
+    splits.anchors.cache_clear()
+
+
 def write(spec: TaskSpec, path: Path) -> None:
     """Put a spec's anchors and facts into its task file; all other lines stay as they are.
 
@@ -105,13 +139,10 @@ def write(spec: TaskSpec, path: Path) -> None:
     """
     if spec.anchors is None:
         raise SpecError(f"{spec.task}: nothing measured to write")
-    anchors = spec.anchors
     lines = [
         _without(path.read_text(encoding="utf-8"), ("anchors", "calibration")),
         "[anchors]",
-        f"random = {_toml(anchors.random)}",
-        f"reference = {_toml(anchors.reference)}",
-        f'reference_is = "{anchors.reference_is}"',
+        *_lines(spec.anchors),
         "",
         "[calibration]",
         *(f"{name} = {value}" for name, value in spec.calibration.items()),
@@ -163,6 +194,14 @@ def _anchor(rows: Sequence[Row]) -> Anchor:
     return Anchor(
         mean=round(mean, 4), ci95=(round(interval[0], 4), round(interval[1], 4)), episodes=len(rows)
     )
+
+
+def _lines(anchors: Anchors) -> list[str]:
+    return [
+        f"random = {_toml(anchors.random)}",
+        f"reference = {_toml(anchors.reference)}",
+        f'reference_is = "{anchors.reference_is}"',
+    ]
 
 
 def _toml(anchor: Anchor) -> str:

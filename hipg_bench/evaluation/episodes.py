@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hipg_bench.env import Step
-from hipg_bench.errors import AgentFailure, HipgError
+from hipg_bench.errors import AgentFailure, HipgError, HostFailure
 from hipg_bench.evaluation import splits
 from hipg_bench.evaluation.failures import (
     NOT_PLAYED,
@@ -167,11 +167,19 @@ class Plan:
         return made, Watched(policy, made.env.action_size, alone=len(worlds) == 1)
 
     def _play(self, spec: TaskSpec, policy: Policy, worlds: list[int], advance: Advance) -> list[Row]:
-        """Play worlds together; with one world alone a failure stands in its row.
+        """Play worlds together, a second time if this machine was at fault.
 
         Raises:
             AgentFailure: the policy failed, and there are several worlds.
+            HostFailure: this machine was at fault twice.
         """
+        try:
+            return self._play_once(spec, policy, worlds, advance)
+        except HostFailure:
+            return self._play_once(spec, policy, worlds, advance)
+
+    def _play_once(self, spec: TaskSpec, policy: Policy, worlds: list[int], advance: Advance) -> list[Row]:
+        """Play worlds together; with one world alone the agent's failure stands in its row."""
         made, watched = self._begin(spec, policy, worlds, self.threads)
         rows: list[Row] = [{}] * len(worlds)
         running = np.ones(len(worlds), bool)
@@ -188,7 +196,7 @@ class Plan:
                 told += len(worlds) / spec.horizon
                 if not running.any():
                     break
-        except AgentFailure:
+        except (AgentFailure, HostFailure):
             advance(-told)
             raise
         finally:

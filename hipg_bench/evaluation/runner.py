@@ -20,7 +20,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hipg_bench.errors import BundleError, ResumeError
+from hipg_bench.errors import BundleError, ResumeError, UnknownNameError
 from hipg_bench.evaluation import films, report, splits
 from hipg_bench.evaluation.episodes import Plan, Row, versions
 from hipg_bench.evaluation.failures import NOT_PLAYED, close
@@ -47,7 +47,9 @@ def quiet(stage: str, done: float) -> None:
     """Tell nobody."""
 
 
-def playable(agent: Agent, suite: Suite) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
+def playable(
+    agent: Agent, suite: Suite, split: str = splits.STANDARD
+) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
     """Training seeds per task that the agent plays, and the reason per task that it does not.
 
     Raises:
@@ -61,10 +63,11 @@ def playable(agent: Agent, suite: Suite) -> tuple[dict[str, tuple[int, ...]], di
             skipped[spec.task] = f"no {'weights' if agent.card.kind == 'network' else 'policy'} for this task"
             continue
         try:
+            splits.setting(split, spec).background_policy(spec)
             for train_seed in found:
                 close(agent.policy(spec, train_seed))
             seeds[spec.task] = found
-        except BundleError as error:
+        except (BundleError, UnknownNameError) as error:
             skipped[spec.task] = str(error)
     if not seeds:
         raise BundleError(
@@ -94,7 +97,7 @@ def evaluate(
         BundleError: the agent plays none of the tasks.
         ResumeError: ``out`` belongs to another evaluation.
     """
-    seeds, skipped = playable(agent, suite)
+    seeds, skipped = playable(agent, suite, plan.split)
     specs = [splits.with_anchors(plan.split, spec) for spec in suite.specs]
     worlds = {"seed": plan.seed} if plan.salt is None else {"commitment": commitment(plan.salt)}
     _claim(out, {"agent": agent.name, "split": plan.split, **worlds, "versions": versions()})

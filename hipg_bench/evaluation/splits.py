@@ -21,7 +21,7 @@ from jaxtyping import Bool, Int
 
 from hipg_bench import registry
 from hipg_bench.env import BatchEnv
-from hipg_bench.errors import SpecError, UnknownNameError, hint
+from hipg_bench.errors import BundleError, SpecError, UnknownNameError, hint
 from hipg_bench.families.family import Family
 from hipg_bench.paths import data_folder
 from hipg_bench.policies.network import load_network
@@ -112,14 +112,19 @@ class Setting(Params):
         return theirs
 
     def background_policy(self, spec: TaskSpec) -> Policy | None:
-        """Who steers them; None if the team is whole."""
+        """Who steers them; None if the team is whole.
+
+        Raises:
+            BundleError: the background is made for other bodies.
+        """
         if not self.background:
             return None
-        return (
-            Scripted(spec, blind=True)
-            if self.background == _BLIND
-            else load_network(folder() / self.background)
-        )
+        if self.background == _BLIND:
+            return Scripted(spec, blind=True)
+        network, layout = load_network(folder() / self.background), registry.family_of(spec).layout
+        if (network.observation_size, network.action_size) != (layout.observation.size, layout.action.size):
+            raise BundleError(f"{spec.task}: {self.background} is made for other bodies")
+        return network
 
 
 def setting(split: str, spec: TaskSpec) -> Setting:
