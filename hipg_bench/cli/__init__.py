@@ -10,7 +10,19 @@ import sys
 
 import typer
 
-from hipg_bench.cli import agents, audit, bench, calibrate, collect, doctor, evaluate, media, tasks, train
+from hipg_bench.cli import (
+    agents,
+    audit,
+    bench,
+    calibrate,
+    collect,
+    doctor,
+    evaluate,
+    leaderboard,
+    media,
+    tasks,
+    train,
+)
 from hipg_bench.errors import HipgError
 
 app = typer.Typer(
@@ -26,6 +38,7 @@ app.command()(media.video)
 app.command()(media.view)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
+app.add_typer(leaderboard.app, name="leaderboard")
 app.command()(calibrate.calibrate)
 app.command()(audit.audit)
 app.command()(bench.bench)

@@ -23,6 +23,9 @@ Status = Literal["verified", "self-reported", "mismatch", "unsandboxed", "outdat
 hidden worlds are others than those of the verification."""
 
 
+Execution = Literal["decentralised", "centralised"]
+
+
 class Difference(Params):
     """A row that came out otherwise than claimed.
 
@@ -65,7 +68,7 @@ class Verification(Params):
     compared: int
     differing: int = 0
     differences: tuple[Difference, ...] = ()
-    execution: Literal["decentralised", "centralised"]
+    execution: Execution
     reasons: tuple[str, ...] = ()
     versions: dict[str, str] = pydantic.Field(default_factory=dict[str, str])
 
@@ -85,6 +88,7 @@ class Entry(Params):
         claimed: whether the rows on public worlds came with the submission; else the board played them.
         sandbox: what kept the agent apart while the board played: as in `Verification`.
         execution: what the submitter declares.
+        privileged: whether it acts on the joint state; a reference then, never ranked.
         rows: path in the entry's folder to the SHA-256 of the rows in it, unpacked.
         verification: the maintainer's, once there is one.
     """
@@ -94,12 +98,13 @@ class Entry(Params):
     version: int = pydantic.Field(ge=1)
     added: str
     suite: str
-    tier: Literal[0, 1, 2] | None
+    tier: int | None = pydantic.Field(ge=0, le=2)
     bundle: str | None
     policies: dict[str, dict[int, str]]
     claimed: bool
     sandbox: str
-    execution: Literal["decentralised", "centralised"]
+    execution: Execution
+    privileged: bool = False
     rows: dict[str, str]
     verification: Verification | None = None
 

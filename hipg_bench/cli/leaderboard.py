@@ -1,0 +1,242 @@
+"""``hipg-bench leaderboard``: entries, their verification, and the page."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import http.server
+import tempfile
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hipg_bench.cli import console
+
+if TYPE_CHECKING:
+    from hipg_bench.leaderboard.entry import Verification
+    from hipg_bench.leaderboard.playing import Match
+
+app = typer.Typer(help="Scores that others can trust: add, verify, build, serve.", no_args_is_help=True)
+salts = typer.Typer(help="The secret behind the hidden worlds.", no_args_is_help=True)
+app.add_typer(salts, name="salt")
+
+BoardFolder = Annotated[Path, typer.Option("--board", help="The board's folder.")]
+Salt = Annotated[Path, typer.Option("--salt-file", help="The salt; it lies outside any repository.")]
+Threads = Annotated[
+    int, typer.Option(min=0, help="Physics threads, 0 for all cores; no result depends on it.")
+]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Run its code without a sandbox: agents of your own; never verified.")
+]
+BOARD = Path("leaderboard")
+
+
+@app.command()
+def add(
+    what: Annotated[str, typer.Argument(help="A zip or folder of a submission, or a bundled agent's name.")],
+    board: BoardFolder = BOARD,
+    claims: Annotated[
+        Path | None, typer.Option(help="The submitter's own rows: a folder with <split>/episodes/.")
+    ] = None,
+    splits: Annotated[str, typer.Option(help="Splits with commas between, or: all.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Task names with commas between, or: standard.")] = "standard",
+    episodes: Annotated[
+        int, typer.Option(min=3, help="Worlds per policy; fewer than 320 are for trying out.")
+    ] = 320,
+    films: Annotated[str, typer.Option(help="Tasks to film, with commas between, or: all, none.")] = "all",
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Take the place of the entry of that name.")
+    ] = False,
+    trust: Trust = False,
+    threads: Threads = 0,
+) -> None:
+    """Make an agent an entry, self-reported: it plays the public worlds, or its rows come along."""
+    from hipg_bench.leaderboard import adding
+    from hipg_bench.leaderboard.board import Board
+    from hipg_bench.leaderboard.source import opened
+
+    match = _match(splits, tasks, episodes, threads)
+    with opened(what, trust=trust) as source, _telling() as progress:
+        added = adding.add(
+            Board(board), source, match, claims=claims, replace=replace,
+            film_tasks=_filmed(films, match), progress=progress,
+        )  # fmt: skip
+    for trouble in added.trouble:
+        console.err.print(f"no film: {trouble}", markup=False)
+    entry = added.entry
+    console.say(
+        f"[bold]{entry.name}[/bold] is on the board, {entry.status(None)}: "
+        f"{sum(len(seeds) for seeds in entry.policies.values())} policies for {len(entry.policies)} tasks"
+    )
+
+
+@app.command()
+def verify(
+    name: Annotated[str, typer.Argument(help="The entry's name.")],
+    salt_file: Salt,
+    board: BoardFolder = BOARD,
+    trust: Trust = False,
+    threads: Threads = 0,
+) -> None:
+    """Play an entry again: are its rows true, and how does it do on hidden worlds?"""
+    from hipg_bench.leaderboard import verify as verifying
+    from hipg_bench.leaderboard.board import Board
+    from hipg_bench.leaderboard.salt import read_salt
+
+    with _telling() as progress:
+        found = verifying.verify(
+            Board(board), name, read_salt(board, salt_file), trust=trust, threads=threads, progress=progress
+        )
+    _report(name, found)
+    if found.outcome != "verified":
+        raise typer.Exit(1)
+
+
+@app.command()
+def build(
+    out: Annotated[Path, typer.Option(help="Folder for the site; one of ours is replaced.")],
+    board: BoardFolder = BOARD,
+) -> None:
+    """Write the page: a static site that needs no server and no network."""
+    from hipg_bench.leaderboard import site
+    from hipg_bench.leaderboard.board import Board
+
+    count = site.build(Board(board), out)
+    console.say(f"{count} entries")
+    console.out.print(f"{out / 'index.html'}", markup=False, soft_wrap=True)
+
+
+@app.command()
+def serve(
+    board: BoardFolder = BOARD,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port, 0 for any free one.")] = 8000,
+) -> None:
+    """Build the page and show it at this machine only."""
+    from hipg_bench.leaderboard import site
+    from hipg_bench.leaderboard.board import Board
+
+    with tempfile.TemporaryDirectory(prefix="hipg-site-") as place:
+        folder = Path(place) / "site"
+        site.build(Board(board), folder)
+        handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
+        with http.server.ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
+            console.say(f"http://127.0.0.1:{server.server_port}/ (Ctrl-C ends it)")
+            with contextlib.suppress(KeyboardInterrupt):
+                server.serve_forever()
+
+
+@app.command()
+def refresh(
+    salt_file: Annotated[
+        Path | None, typer.Option("--salt-file", help="With it they are verified too.")
+    ] = None,
+    board: BoardFolder = BOARD,
+    episodes: Annotated[int, typer.Option(min=3, help="Worlds per policy.")] = 320,
+    films: Annotated[str, typer.Option(help="Tasks to film, with commas between, or: all, none.")] = "all",
+    threads: Threads = 0,
+) -> None:
+    """Make the entries of all bundled agents anew, in place of those on the board."""
+    from hipg_bench.leaderboard import adding
+    from hipg_bench.leaderboard import verify as verifying
+    from hipg_bench.leaderboard.board import Board
+    from hipg_bench.leaderboard.salt import read_salt
+    from hipg_bench.leaderboard.source import opened
+    from hipg_bench.policies.bundle import agents
+
+    salt = read_salt(board, salt_file) if salt_file else None
+    match = _match("all", "standard", episodes, threads)
+    for name in agents():
+        with _telling() as progress:
+            with opened(name) as source:
+                adding.add(
+                    Board(board),
+                    source,
+                    match,
+                    replace=True,
+                    film_tasks=_filmed(films, match),
+                    progress=progress,
+                )
+            found = (
+                verifying.verify(Board(board), name, salt, threads=threads, progress=progress)
+                if salt
+                else None
+            )
+        if found:
+            _report(name, found)
+        else:
+            console.say(f"[bold]{name}[/bold]: self-reported")
+
+
+@salts.command()
+def new(
+    file: Annotated[Path, typer.Argument(help="Where to keep it, outside any repository.")],
+    board: BoardFolder = BOARD,
+    suite: Annotated[str, typer.Option(help="The suite whose hidden worlds it draws.")] = "hipg-1",
+) -> None:
+    """Draw a salt, and publish its hash on the board."""
+    from hipg_bench.leaderboard.salt import new_salt
+
+    made = new_salt(board, file, suite)
+    console.say(f"{board / 'commitment.json'} now promises {made.sha256}")
+    console.say(f"Keep {file}: without it nothing can be verified. Show it to nobody until you reveal it.")
+
+
+@salts.command()
+def reveal(
+    file: Annotated[Path, typer.Argument(help="The salt that the board is bound to.")],
+    board: BoardFolder = BOARD,
+) -> None:
+    """Publish the salt: everybody can play the hidden worlds again, and a new one can be drawn."""
+    from hipg_bench.leaderboard.salt import reveal_salt
+
+    kept = reveal_salt(board, file)
+    console.say(f"{board / 'commitment.json'} now holds the salt behind {kept.sha256}")
+
+
+def _match(splits: str, tasks: str, episodes: int, threads: int) -> Match:
+    """What the options say is to be played."""
+    from hipg_bench import registry
+    from hipg_bench.errors import UnknownNameError, hint
+    from hipg_bench.evaluation.splits import SPLITS
+    from hipg_bench.leaderboard.playing import SUITE, Match
+
+    chosen = SPLITS if splits == "all" else _names(splits)
+    for split in chosen:
+        if split not in SPLITS:
+            raise UnknownNameError(f"no split {split!r}{hint(split, SPLITS)}")
+    names = registry.tagged(SUITE) if tasks == SUITE else _names(tasks)
+    for task in names:
+        registry.task_spec(task)
+    return Match(tuple(names), chosen, episodes, threads)
+
+
+def _filmed(films: str, match: Match) -> tuple[str, ...]:
+    return {"all": match.tasks, "none": ()}.get(films, _names(films))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
+@contextlib.contextmanager
+def _telling() -> Generator[Callable[[str, float, float], None]]:
+    """A bar for every stage, as it comes."""
+    with console.progress() as bars:
+        ids: dict[str, int] = {}
+
+        def tell(stage: str, done: float, total: float) -> None:
+            if stage not in ids:
+                ids[stage] = bars.add_task(stage, total=total)
+            bars.advance(bars.task_ids[ids[stage]], done)
+
+        yield tell
+
+
+def _report(name: str, found: Verification) -> None:
+    """What a verification found."""
+    console.say(f"[bold]{name}[/bold]: {found.outcome}, {found.execution}, sandbox {found.sandbox}")
+    console.say(f"{found.compared} rows compared, {found.differing} differ")
+    for reason in found.reasons:
+        console.out.print(reason, markup=False, soft_wrap=True)

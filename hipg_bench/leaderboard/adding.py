@@ -1,0 +1,178 @@
+"""`add`: an agent becomes an entry, with rows on the public worlds, curves and films.
+
+The rows are the submitter's own, where they come along as ``<split>/episodes/<task>.jsonl``; else the board
+plays them. Nothing else that a submitter says of results is used.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hipg_bench.errors import BoardError
+from hipg_bench.evaluation.episodes import Row
+from hipg_bench.leaderboard import films
+from hipg_bench.leaderboard.board import Board
+from hipg_bench.leaderboard.entry import Entry, now
+from hipg_bench.leaderboard.playing import Match, Progress, keep, play, played_tasks, quiet
+from hipg_bench.leaderboard.rows import parse_rows
+from hipg_bench.leaderboard.shown import run_path
+from hipg_bench.leaderboard.source import BUNDLE, Source
+from hipg_bench.paths import write_text
+from hipg_bench.policies.bundle import Agent
+from hipg_bench.registry import task_spec
+
+CURVE_POINTS = 300
+"""Kept of a learning curve."""
+_MOST_CURVE_BYTES = 8 * 2**20
+
+
+@dataclasses.dataclass(frozen=True)
+class Added:
+    """What came of it: the entry, self-reported, and why films are missing."""
+
+    entry: Entry
+    trouble: tuple[str, ...]
+
+
+def add(
+    board: Board,
+    source: Source,
+    match: Match,
+    *,
+    claims: Path | None = None,
+    replace: bool = False,
+    film_tasks: Sequence[str] = (),
+    progress: Progress = quiet,
+) -> Added:
+    """Put an agent on the board; the entry appears whole, at the end.
+
+    Args:
+        board: where.
+        source: who.
+        match: what is played.
+        claims: folder with the submitter's rows, if they are to be compared with later.
+        replace: take the place of an entry of the same name, which goes into the board's history.
+        film_tasks: of which tasks a film is made.
+        progress: told how far it is.
+
+    Raises:
+        BoardError: the name is taken, or the claimed rows are none.
+        BundleError: the agent plays none of the tasks.
+        ResumeError: the claimed rows are of another agent, suite or version.
+    """
+    agent = source.agent
+    earlier = board.entry(agent.name) if replace and agent.name in board.names() else None
+    with board.draft(agent.name, earlier) as folder:
+        _copy_card(source, folder)
+        work = folder / ".work"
+        claimed = [split for split in match.splits if claims is not None and _bring(claims, split, work)]
+        if claims is not None and not claimed:
+            raise BoardError(f"{claims} holds no rows: <split>/episodes/<task>.jsonl is expected")
+        hashes: dict[str, str] = {}
+        for split in match.splits:
+            run = play(agent, match, split, work, progress=progress)
+            hashes |= keep(run, folder, "public", split)
+        _copy_curves(agent, folder)
+        trouble = films.make(agent, match, film_tasks, work, folder, progress)
+        policies = {task: agent.train_seeds(task) for task in played_tasks(work / match.splits[0])}
+        entry = Entry(
+            name=agent.name,
+            version=1 if earlier is None else earlier.version + (source.bundle is not None),
+            added=now(),
+            suite=agent.card.suite,
+            tier=agent.card.tier,
+            bundle=source.digest,
+            policies={
+                task: {seed: agent.fingerprint(task, seed) for seed in seeds}
+                for task, seeds in policies.items()
+            },
+            claimed=bool(claimed),
+            sandbox=source.sandbox,
+            execution=agent.card.execution,
+            privileged=any(
+                agent.policy(task_spec(task), seeds[0]).privileged for task, seeds in policies.items()
+            ),
+            rows=hashes,
+        )
+        shutil.rmtree(work)
+        board.write(folder, entry)
+    return Added(entry, tuple(trouble))
+
+
+def _copy_card(source: Source, folder: Path) -> None:
+    shutil.copyfile(source.agent.folder / "agent.toml", folder / "agent.toml")
+    readme = source.agent.folder / "README.md"
+    if readme.is_file():
+        shutil.copyfile(readme, folder / "README.md")
+    if source.bundle is not None:
+        shutil.copyfile(source.bundle, folder / BUNDLE)
+
+
+def _bring(claims: Path, split: str, work: Path) -> bool:
+    """Lay claimed rows where the evaluation goes on from them; say whether there are any."""
+    found = sorted((claims / split / "episodes").glob("*.jsonl"))
+    for path in found:
+        text = path.read_bytes()
+        for row in parse_rows(text, path.name):
+            _check(row, path.name)
+        target = work / run_path("public", split) / "episodes" / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(text)
+    return bool(found)
+
+
+def _check(row: Row, where: str) -> None:
+    """Refuse a row that numbers cannot be computed from; whether they are true, `verify` finds out.
+
+    Raises:
+        BoardError: a field is missing, of another type, or not finite.
+    """
+    for name, kinds in _FIELDS.items():
+        value = row.get(name, _MISSING)
+        if not isinstance(value, kinds) or (isinstance(value, float) and not math.isfinite(value)):
+            got = "nothing" if value is _MISSING else repr(value)[:60]
+            allowed = " or ".join(kind.__name__ for kind in kinds)
+            raise BoardError(f"{where}: world {row['world']}: {name} is {got}; {allowed} is allowed")
+
+
+_MISSING = object()
+_NUMBER, _MAYBE = (int, float), (int, float, type(None))
+_FIELDS: dict[str, tuple[type, ...]] = {
+    "task": (str,), "split": (str,), "agent": (str,), "policy": (str,), "status": (str,),
+    "end_reason": (str,), "return": _NUMBER, "reached": _MAYBE, "score": _MAYBE, "length": _MAYBE,
+    "survival": _MAYBE, "deaths": _MAYBE, "first_death": _MAYBE, "death_list": (list,), "metrics": (dict,),
+}  # fmt: skip
+"""What a row must hold for its task to be summed up."""
+
+
+def _copy_curves(agent: Agent, folder: Path) -> None:
+    """Keep the learning curves: two columns, and few enough points for a chart."""
+    for task in agent.tasks:
+        for seed in agent.train_seeds(task):
+            path = agent.folder / task / f"seed{seed}.curve.csv"
+            if path.is_file() and path.stat().st_size <= _MOST_CURVE_BYTES:
+                points = list(_points(path))
+                step = math.ceil(len(points) / CURVE_POINTS) or 1
+                # the last point stays
+                lines = [f"{steps:g},{value:.6g}\n" for steps, value in reversed(points[::-1][::step])]
+                if lines:
+                    write_text(
+                        folder / "curves" / task / f"seed{seed}.csv", "steps,return\n" + "".join(lines)
+                    )
+
+
+def _points(path: Path) -> Iterator[tuple[float, float]]:
+    """The points of a learning curve that are numbers."""
+    with path.open(encoding="utf-8", errors="replace", newline="") as lines:
+        for row in csv.DictReader(lines):
+            try:
+                steps, value = float(row["steps"]), float(row["return"])
+            except (KeyError, TypeError, ValueError):
+                continue
+            if math.isfinite(steps) and math.isfinite(value):
+                yield steps, value

@@ -1,0 +1,191 @@
+"""What each page shows beside its words: charts, matrices and films, made from entries."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hipg_bench.evaluation import splits
+from hipg_bench.leaderboard.charts import Chart, Series, chart
+from hipg_bench.leaderboard.shown import Shown
+from hipg_bench.leaderboard.standings import Line, Panel
+from hipg_bench.spec import TaskSpec
+
+COLOURS = 8
+"""Entries that a chart can tell apart."""
+_PROFILE = np.linspace(-0.25, 1.25, 121)
+
+
+@dataclasses.dataclass(frozen=True)
+class Better:
+    """How sure it is that the entry of a row beats that of a column, on a task drawn at random.
+
+    Attributes:
+        names: of rows and columns.
+        shares: by row, then column; None on the diagonal.
+    """
+
+    names: Sequence[str]
+    shares: Sequence[Sequence[float | None]]
+
+
+def drawn(panel: Panel) -> list[Shown]:
+    """The best entries, and all references, in the order of the table."""
+    lines = [*panel.verified, *panel.reported]
+    best = sorted((line for line in lines if line.rank is not None), key=lambda line: -line.score)[:COLOURS]
+    kept = {line.shown.name for line in best} | {line.shown.name for line in lines if line.rank is None}
+    return [line.shown for line in lines if line.shown.name in kept]
+
+
+def colours(entries: Sequence[Shown]) -> dict[str, str]:
+    """Entry to its class in the style sheet, the same on all pages."""
+    found: dict[str, str] = {}
+    for one in entries:
+        reference = one.kind == "reference"
+        many = sum(("reference" in colour) == reference for colour in found.values())
+        found[one.name] = f"c{many}" if not reference else "reference dotted" if many else "reference"
+    return found
+
+
+def overview(panels: Sequence[Panel], specs: Sequence[TaskSpec]) -> dict[str, Any]:
+    """What the front page shows: per split a performance profile, P(improvement), and scores by task."""
+    main = [panel for panel in panels if panel.family == "all"]
+    entries = drawn(main[0]) if main else []
+    colour = colours(entries)
+    return {
+        "colour": colour,
+        "profiles": {panel.split: _profile(entries, panel.split, specs, colour) for panel in main},
+        "better": {panel.split: _better(entries, panel.split, specs) for panel in main},
+        "lines": {panel.split: [*panel.verified, *panel.reported] for panel in main},
+        "cards": [(spec, _best_film(main[0], spec)) for spec in specs] if main else [],
+    }
+
+
+def task(entries: Sequence[Shown], shown: Sequence[Shown], spec: TaskSpec) -> dict[str, Any]:
+    """What a task's page shows."""
+    colour = colours(shown)
+    players = [one for one in shown if one.task("standard", spec.task) is not None]
+    found = [(one, one.task(split, spec.task), split) for split in splits.SPLITS for one in entries]
+    return {
+        "colour": colour,
+        "players": players,
+        "films": [(one, one.films[spec.task]) for one in players if spec.task in one.films],
+        "scores": {
+            split: sorted(
+                [(one, numbers) for one, numbers, where in found if numbers is not None and where == split],
+                key=lambda pair: -pair[1]["return_mean"],
+            )
+            for split in splits.SPLITS
+        },
+        "learning": _learning(players, spec, colour),
+        "by_deaths": _by_deaths(players, spec, colour),
+    }
+
+
+def agent(one: Shown, specs: Sequence[TaskSpec]) -> dict[str, Any]:
+    """What an entry's page shows."""
+    colour = {one.name: "c0"}
+    by_task = {
+        spec.task: {split: one.task(split, spec.task) for split in splits.SPLITS if one.result(split)}
+        for spec in specs
+    }
+    return {
+        "by_task": {name: found for name, found in by_task.items() if any(found.values())},
+        "unplayed": (one.result("standard") or {"skipped": []})["skipped"],
+        "curves": [
+            (spec, _learning([one], spec, colour, alone=True)) for spec in specs if spec.task in one.curves
+        ],
+        "specs": {spec.task: spec for spec in specs},
+    }
+
+
+def _runs(one: Shown, split: str, specs: Sequence[TaskSpec]) -> dict[str, list[float]]:
+    """Scores of every trained policy, by task."""
+    found = {spec.task: one.task(split, spec.task) for spec in specs}
+    return {
+        name: [run["score"] for run in numbers["runs"] if run["score"] is not None]
+        for name, numbers in found.items()
+        if numbers is not None
+    }
+
+
+def _profile(
+    entries: Sequence[Shown], split: str, specs: Sequence[TaskSpec], colour: Mapping[str, str]
+) -> Chart | None:
+    """Share of (task, trained policy) that reach a score, over the score."""
+    series: list[Series] = []
+    for one in entries:
+        runs = [score for scores in _runs(one, split, specs).values() for score in scores]
+        if runs:
+            shares = [(float(at), float(np.mean(np.array(runs) > at))) for at in _PROFILE]
+            series.append(Series(one.name, colour[one.name], shares, stairs=True))
+    return chart(
+        series,
+        x_label="score",
+        y_label="share of tasks above it",
+        x_limits=(-0.25, 1.25),
+        y_limits=(0.0, 1.02),
+        legend=True,
+    )
+
+
+def _better(entries: Sequence[Shown], split: str, specs: Sequence[TaskSpec]) -> Better:
+    runs = {one.name: _runs(one, split, specs) for one in entries if one.result(split)}
+    return Better(
+        list(runs),
+        [[None if a == b else _chance(runs[a], runs[b]) for b in runs] for a in runs],
+    )
+
+
+def _chance(a: Mapping[str, Sequence[float]], b: Mapping[str, Sequence[float]]) -> float | None:
+    """P(improvement): mean over common tasks of the share of pairs in which the first is better."""
+    common = [task for task in a if task in b]
+    shares = [
+        np.mean([(x > y) + 0.5 * (x == y) for x in a[task] for y in b[task]])
+        for task in common
+        if a[task] and b[task]
+    ]
+    return float(np.mean(shares)) if shares else None
+
+
+def _best_film(panel: Panel, spec: TaskSpec) -> tuple[Shown, Line] | None:
+    """Who of the ranked has the best film of a task."""
+    lines = [line for line in (*panel.verified, *panel.reported) if spec.task in line.shown.films]
+    ranked = [line for line in lines if line.rank is not None and line.shown.task("standard", spec.task)]
+    best = max(ranked, key=lambda line: line.shown.task("standard", spec.task)["return_mean"], default=None)  # type: ignore[index]
+    return (best.shown, best) if best else None
+
+
+def _learning(
+    entries: Sequence[Shown], spec: TaskSpec, colour: Mapping[str, str], *, alone: bool = False
+) -> Chart | None:
+    """Return over environment steps, a curve per trained policy."""
+    series = [
+        Series(f"seed {seed}" if alone else one.name, colour[one.name], points)
+        for one in entries
+        for curves in [one.curves.get(spec.task, {})]
+        for seed, points in curves.items()
+        if len(points) > 1
+    ]
+    return chart(series, x_label="environment steps", y_label="team return", levels=_anchors(spec))
+
+
+def _by_deaths(entries: Sequence[Shown], spec: TaskSpec, colour: Mapping[str, str]) -> Chart | None:
+    """Mean return of the episodes in which so many agents died."""
+    series: list[Series] = []
+    for one in entries:
+        found = (one.task("standard", spec.task) or {"return_by_deaths": []})["return_by_deaths"]
+        whole = sum(group["episodes"] for group in found)
+        points = [(float(group["deaths"]), float(group["return_mean"])) for group in found]
+        weights = [group["episodes"] / whole for group in found]
+        series.append(Series(one.name, colour[one.name], points, weights))
+    return chart(series, x_label="agents that died", y_label="team return", whole_x=True)
+
+
+def _anchors(spec: TaskSpec) -> list[tuple[str, float]]:
+    if spec.anchors is None:
+        return []
+    return [("random", spec.anchors.random.mean), ("reference", spec.anchors.reference.mean)]

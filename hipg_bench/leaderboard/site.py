@@ -1,0 +1,190 @@
+"""`build`: the board as a static site, which opens from a folder without server or network.
+
+    index.html               the tables, how sure they are, and what everything means
+    tasks/<task>.html        one task: films side by side, learning curves, scores
+    agents/<name>.html       one entry: its model card, who checked it, its numbers and rows
+    data/                    the same for programs
+
+Everything a submitter wrote passes through the templates' escaping; the pages allow no script but their
+own, by its hash.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import jinja2
+import markupsafe
+
+from hipg_bench import registry
+from hipg_bench.errors import BoardError
+from hipg_bench.evaluation import splits
+from hipg_bench.leaderboard import pictures, standings
+from hipg_bench.leaderboard.board import Board
+from hipg_bench.leaderboard.salt import Commitments, read_commitments
+from hipg_bench.leaderboard.shown import Shown, read_board
+from hipg_bench.spec import TaskSpec
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_MARK = "hipg-bench-site"
+"""A file that tells a site of ours from a folder that must not be replaced."""
+SPLIT_NAMES = {
+    "standard": "Standard",
+    "shift": "Shifted physics",
+    "forced_death": "Forced death",
+    "ad_hoc": "Ad-hoc team",
+}
+STATUS_SAYS = {
+    "verified": "A maintainer ran it again, apart from everything else: its rows came out byte for byte, "
+    "and the scores are those of hidden worlds.",
+    "self-reported": "The rows are on public worlds, and nobody has checked them on hidden ones yet.",
+    "mismatch": "Run again, rows came out otherwise than claimed.",
+    "unsandboxed": "It was run by somebody who trusted it, without a sandbox: it could have cheated.",
+    "outdated": "It was verified on hidden worlds that have since been revealed.",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What all pages draw from."""
+
+    entries: Sequence[Shown]
+    specs: Sequence[TaskSpec]
+    panels: Sequence[standings.Panel]
+    commitments: Commitments
+
+    @property
+    def drawn(self) -> list[Shown]:
+        """The entries that charts show: the best ones, and the references."""
+        return pictures.drawn(self.panels[0]) if self.panels else []
+
+
+def build(board: Board, out: Path) -> int:
+    """Write the site into a folder, in place of an earlier one; return how many entries it shows.
+
+    Raises:
+        BoardError: the folder holds something else, or the board has no entries or damaged ones.
+    """
+    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
+        raise BoardError(f"{out} holds something else: choose an empty folder for the site")
+    entries = read_board(board)
+    if not entries:
+        raise BoardError(f"{board.root} has no entries: add one with `hipg-bench leaderboard add`")
+    specs = [registry.task_spec(task) for task in registry.tagged("standard")]
+    view = View(entries, specs, standings.panels(entries, specs), read_commitments(board.root))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as place:
+        fresh, old = Path(place) / "new", Path(place) / "old"
+        fresh.mkdir()
+        (fresh / _MARK).write_text("made by hipg-bench leaderboard build\n", encoding="utf-8")
+        _pages(view, fresh)
+        _data(view, fresh / "data")
+        if out.exists():
+            out.rename(old)
+        fresh.rename(out)
+    return len(entries)
+
+
+def _pages(view: View, out: Path) -> None:
+    environment = _environment()
+    common: dict[str, Any] = {
+        "view": view, "splits": splits.SPLITS, "split_names": SPLIT_NAMES, "status_says": STATUS_SAYS,
+        **_inline("style.css"), **_inline("page.js"),
+    }  # fmt: skip
+    seen = pictures.overview(view.panels, view.specs)
+    _write(environment, "index.html.j2", out / "index.html", common | seen)
+    for spec in view.specs:
+        seen = {"spec": spec} | pictures.task(view.entries, view.drawn, spec)
+        _write(environment, "task.html.j2", out / "tasks" / f"{spec.task}.html", common | seen)
+    for one in view.entries:
+        seen = {"one": one} | pictures.agent(one, view.specs)
+        _write(environment, "agent.html.j2", out / "agents" / f"{one.name}.html", common | seen)
+
+
+def _write(environment: jinja2.Environment, template: str, path: Path, values: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    root = "" if path.name == "index.html" else "../"
+    path.write_text(environment.get_template(template).render(root=root, **values), encoding="utf-8")
+
+
+def _inline(name: str) -> dict[str, str]:
+    """The page's own style or script, and its hash for the content security policy."""
+    text = (_TEMPLATES / name).read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    key = name.split(".")[0]
+    return {key: text, f"{key}_hash": f"'sha256-{digest}'"}
+
+
+def _environment() -> jinja2.Environment:
+    """Templates with escaping on."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    filters = cast(dict[str, Any], environment.filters)
+    filters |= {
+        "number": _number, "share": _share, "interval": _interval, "place": place, "breakable": _breakable,
+    }  # fmt: skip
+    return environment
+
+
+def place(score: float) -> float:
+    """Where a score stands on the score axis, in percent; the axis runs from -0.25 to 1.25."""
+    return round(100 * min(max((score + 0.25) / 1.5, 0.0), 1.0), 2)
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    """A number with a true minus sign, or a dash where it is not defined."""
+    if value is None:
+        return "\u2013"
+    # no minus sign before a zero
+    return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "\u2212")
+
+
+def _breakable(name: str) -> markupsafe.Markup:
+    """A name that may continue on the next line after an underscore."""
+    return markupsafe.Markup("_<wbr>").join(name.split("_"))
+
+
+def _share(value: float | None) -> str:
+    return "\u2013" if value is None else f"{100 * value:.0f} %"
+
+
+def _interval(ends: Sequence[float] | None, digits: int = 2) -> str:
+    return "" if ends is None else f"[{_number(ends[0], digits)}, {_number(ends[1], digits)}]"
+
+
+def _data(view: View, out: Path) -> None:
+    """Rows, results and films of every entry, and the board in one file."""
+    for one in view.entries:
+        for path in sorted(one.folder.rglob("*")):
+            kept = path.suffix in (".gz", ".csv", ".mp4") or path.name in (
+                "results.json",
+                "entry.json",
+                "agent.toml",
+            )
+            if kept and path.is_file():
+                target = out / one.name / path.relative_to(one.folder)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, target)
+    summary = [
+        {
+            "split": panel.split, "family": panel.family, "worlds": worlds, "rank": line.rank,
+            "name": line.shown.name, "status": line.shown.status, "kind": line.shown.kind,
+            "score_iqm": line.score, "score_iqm_ci95": line.ci95, "survival": line.survival,
+            "deaths": line.deaths, "tasks_played": line.played, "tasks": line.tasks, "dnf": line.dnf,
+        }
+        for panel in view.panels
+        for worlds, lines in (("hidden", panel.verified), ("public", panel.reported))
+        for line in lines
+    ]  # fmt: skip
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "board.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,154 @@
+"""`verify`: a maintainer plays an entry again, compares with what it claims, and scores it on hidden worlds.
+
+Agents whose code or graph comes from others play in the sandbox, from the packed submission as it was
+entered. The salt stays in this process: the agent sees observations, and worlds' seeds are told to nobody.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from hipg_bench.errors import BoardError
+from hipg_bench.evaluation import decentralised
+from hipg_bench.evaluation.episodes import versions
+from hipg_bench.leaderboard.board import Board
+from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
+from hipg_bench.leaderboard.playing import Match, Progress, keep, play, quiet
+from hipg_bench.leaderboard.rows import compare, unpack
+from hipg_bench.leaderboard.salt import commitment_of, read_commitments
+from hipg_bench.leaderboard.shown import Shown, read_shown, rows_path
+from hipg_bench.leaderboard.source import Source, reopened
+from hipg_bench.policies.bundle import Agent
+from hipg_bench.registry import task_spec
+from hipg_bench.sandbox import choice
+
+_KEPT = 20
+"""Differences that are written down."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Comparison:
+    """What playing the public worlds again showed."""
+
+    compared: int
+    differences: Sequence[Difference]
+
+
+def verify(
+    board: Board, name: str, salt: bytes, *, trust: bool = False, threads: int = 0, progress: Progress = quiet
+) -> Verification:
+    """Check an entry, and write down what came of it; hidden worlds are played only if all rows are true.
+
+    Args:
+        board: where.
+        name: which entry.
+        salt: behind the hidden worlds.
+        trust: run its code without a sandbox; it is ``unsandboxed`` then.
+        threads: physics threads, 0 for all cores.
+        progress: told how far it is.
+
+    Raises:
+        BoardError: the salt is not the promised one, or the entry is damaged or changed meanwhile.
+        UnknownNameError: no such entry.
+    """
+    promised = read_commitments(board.root).sha256
+    if commitment_of(salt) != promised:
+        raise BoardError(f"this salt is not the one that {board.root} is bound to")
+    shown = read_shown(board.folder(name), promised)
+    with (
+        reopened(shown.folder, shown.entry, trust=trust) as source,
+        board.draft(name, shown.entry) as draft,
+        tempfile.TemporaryDirectory(prefix="hipg-verify-") as place,
+    ):
+        work = Path(place)
+        shutil.copytree(shown.folder, draft, dirs_exist_ok=True)
+        shutil.rmtree(draft / "hidden", ignore_errors=True)
+        rows = {path: digest for path, digest in shown.entry.rows.items() if not path.startswith("hidden/")}
+        seen = _compare(shown, source.agent, work, threads, progress)
+        execution, said = _audit(source.agent, shown, salt)
+        outcome, reasons = _outcome(shown.entry, source, seen)
+        if outcome != "mismatch":
+            for split, match in _matches(shown, threads).items():
+                run = play(source.agent, match, split, work, salt, progress)
+                rows |= keep(run, draft, "hidden", split)
+        found = Verification(
+            date=now(),
+            outcome=outcome,
+            commitment=commitment_of(salt),
+            sandbox=source.sandbox,
+            compared=seen.compared,
+            differing=len(seen.differences),
+            differences=tuple(seen.differences[:_KEPT]),
+            execution=execution,
+            reasons=(*reasons, *said),
+            versions=versions(),
+        )
+        board.write(draft, shown.entry.model_copy(update={"rows": rows, "verification": found}))
+    return found
+
+
+def _matches(shown: Shown, threads: int) -> dict[str, Match]:
+    """What was played of each split when the entry was made."""
+    return {
+        split: Match(
+            tasks=tuple(one["task"] for one in (*result["tasks"], *result["skipped"])),
+            splits=(split,),
+            episodes=result["episodes_per_policy"],
+            threads=threads,
+        )
+        for (worlds, split), result in shown.results.items()
+        if worlds == "public"
+    }
+
+
+def _compare(shown: Shown, agent: Agent, work: Path, threads: int, progress: Progress) -> _Comparison:
+    """Play the public worlds again, and compare row by row."""
+    compared, differences = 0, list[Difference]()
+    for split, match in _matches(shown, threads).items():
+        run = play(agent, match, split, work, progress=progress)
+        ours = {path.stem: path.read_bytes() for path in (run / "episodes").glob("*.jsonl")}
+        theirs = {
+            task: unpack(shown.folder / path)
+            for task in match.tasks
+            if (path := rows_path("public", split, task)) in shown.entry.rows
+        }
+        for task in sorted({*ours, *theirs}):
+            differences += compare(split, task, theirs.get(task, b""), ours.get(task, b""))
+            compared += ours.get(task, b"").count(b"\n")
+    return _Comparison(compared, differences)
+
+
+def _audit(agent: Agent, shown: Shown, salt: bytes) -> tuple[Execution, tuple[str, ...]]:
+    """Whether each agent acts on what it sees alone: so by construction, or by replay of code of others."""
+    if shown.entry.privileged or agent.card.execution == "centralised":
+        return "centralised", ()
+    if agent.card.tier != 2:
+        return "decentralised", ()
+    for task, seeds in shown.entry.policies.items():
+        plan = Match(episodes=2, threads=1).plan("standard", salt)
+        verdict = decentralised.verify(task_spec(task), agent.policy(task_spec(task), min(seeds)), plan)
+        if not verdict.decentralised:
+            return "centralised", (f"{task}: {verdict}",)
+    return "decentralised", ()
+
+
+def _outcome(entry: Entry, source: Source, seen: _Comparison) -> tuple[Outcome, tuple[str, ...]]:
+    """The badge, and why it is not the best one."""
+    agent = source.agent
+    reasons: list[str] = []
+    for task, seeds in entry.policies.items():
+        if {seed: agent.fingerprint(task, seed) for seed in agent.train_seeds(task)} != seeds:
+            reasons.append(f"{task}: the policies are not those that were entered")
+    if seen.differences:
+        first = seen.differences[0]
+        where = f"{first.split}, {first.task}, seed {first.train_seed}, world {first.world}"
+        reasons.append(f"{len(seen.differences)} of {seen.compared} rows differ, first {where}: {first.what}")
+    if reasons:
+        return "mismatch", tuple(reasons)
+    if source.sandbox == choice.NONE:
+        return "unsandboxed", ("it was trusted with the machine while it played",)
+    return "verified", ()
