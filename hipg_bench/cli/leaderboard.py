@@ -173,12 +173,12 @@ def refresh(
 def new(
     file: Annotated[Path, typer.Argument(help="Where to keep it, outside any repository.")],
     board: BoardFolder = BOARD,
-    suite: Annotated[str, typer.Option(help="The suite whose hidden worlds it draws.")] = "hipg-1",
 ) -> None:
     """Draw a salt, and publish its hash on the board."""
+    from hipg_bench.evaluation.seeds import SUITE
     from hipg_bench.leaderboard.salt import new_salt
 
-    made = new_salt(board, file, suite)
+    made = new_salt(board, file, SUITE)
     console.say(f"{board / 'commitment.json'} now promises {made.sha256}")
     console.say(f"Keep {file}: without it nothing can be verified. Show it to nobody until you reveal it.")
 

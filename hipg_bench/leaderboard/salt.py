@@ -6,13 +6,13 @@ choose worlds afterwards; once the salt is revealed, everybody can play the hidd
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import secrets
 from pathlib import Path
 
 from hipg_bench.errors import BoardError, SpecError
+from hipg_bench.evaluation.seeds import commitment
 from hipg_bench.leaderboard.entry import now
 from hipg_bench.paths import write_text
 from hipg_bench.spec import Params, parse
@@ -50,11 +50,6 @@ class Commitments(Params):
         return self.current.sha256 if self.current else None
 
 
-def commitment_of(salt: bytes) -> str:
-    """What is published of a salt: its SHA-256, in hexadecimal."""
-    return hashlib.sha256(salt).hexdigest()
-
-
 def read_commitments(board: Path) -> Commitments:
     """What a board's folder promises; nothing, if it has no ``commitment.json``.
 
@@ -90,7 +85,7 @@ def new_salt(board: Path, file: Path, suite: str) -> Commitment:
     file.parent.mkdir(parents=True, exist_ok=True)
     with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
         opened.write(salt.hex() + "\n")
-    made = Commitment(suite=suite, sha256=commitment_of(salt), created=now())
+    made = Commitment(suite=suite, sha256=commitment(salt), created=now())
     _write(board, commitments.model_copy(update={"current": made}))
     return made
 
@@ -118,10 +113,10 @@ def read_salt(board: Path, file: Path) -> bytes:
         raise BoardError(f"{file} holds no salt: {2 * _BYTES} hexadecimal digits are expected") from error
     if len(salt) != _BYTES:
         raise BoardError(f"{file} holds {len(salt)} bytes: a salt has {_BYTES}")
-    if commitment_of(salt) != commitments.current.sha256:
+    if commitment(salt) != commitments.current.sha256:
         raise BoardError(
             f"{file} is not the salt that {board} is bound to: "
-            f"its SHA-256 is {commitment_of(salt)[:12]}..., promised was {commitments.current.sha256[:12]}..."
+            f"its SHA-256 is {commitment(salt)[:12]}..., promised was {commitments.current.sha256[:12]}..."
         )
     return salt
 

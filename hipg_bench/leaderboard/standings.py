@@ -63,20 +63,26 @@ def panels(entries: Sequence[Shown], specs: Sequence[TaskSpec]) -> list[Panel]:
     return [
         _panel(entries, specs, split, family)
         for split in splits.SPLITS
-        if any(one.result(split) for one in entries)
+        if any(_scored(one, split) for one in entries)
         for family in families
     ]
 
 
 def _panel(entries: Sequence[Shown], specs: Sequence[TaskSpec], split: str, family: str) -> Panel:
     chosen = [spec for spec in specs if family in (ALL, spec.family)]
-    there = [one for one in entries if one.result(split) is not None]
+    there = [one for one in entries if _scored(one, split)]
     return Panel(
         split,
         family,
         _ranked([_line(one, chosen, split) for one in there if one.worlds == "hidden"]),
         _ranked([_line(one, chosen, split) for one in there if one.worlds == "public"]),
     )
+
+
+def _scored(one: Shown, split: str) -> bool:
+    """Whether an entry played a split whose anchors are measured."""
+    result = one.result(split)
+    return result is not None and result["aggregate"]["score_iqm"] is not None
 
 
 def _line(one: Shown, specs: Sequence[TaskSpec], split: str) -> Line:

@@ -15,11 +15,12 @@ from pathlib import Path
 from hipg_bench.errors import BoardError
 from hipg_bench.evaluation import decentralised
 from hipg_bench.evaluation.episodes import versions
+from hipg_bench.evaluation.seeds import commitment
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
 from hipg_bench.leaderboard.playing import Match, Progress, keep, play, quiet
 from hipg_bench.leaderboard.rows import compare, unpack
-from hipg_bench.leaderboard.salt import commitment_of, read_commitments
+from hipg_bench.leaderboard.salt import read_commitments
 from hipg_bench.leaderboard.shown import Shown, read_shown, rows_path
 from hipg_bench.leaderboard.source import Source, reopened
 from hipg_bench.policies.bundle import Agent
@@ -56,7 +57,7 @@ def verify(
         UnknownNameError: no such entry.
     """
     promised = read_commitments(board.root).sha256
-    if commitment_of(salt) != promised:
+    if commitment(salt) != promised:
         raise BoardError(f"this salt is not the one that {board.root} is bound to")
     shown = read_shown(board.folder(name), promised)
     with (
@@ -78,7 +79,7 @@ def verify(
         found = Verification(
             date=now(),
             outcome=outcome,
-            commitment=commitment_of(salt),
+            commitment=commitment(salt),
             sandbox=source.sandbox,
             compared=seen.compared,
             differing=len(seen.differences),

@@ -1,0 +1,350 @@
+"""From a zip to a badge: what is claimed is played again, and hidden worlds give the score."""
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hipg_bench.errors import BoardError, BundleError, ResumeError
+from hipg_bench.evaluation import runner
+from hipg_bench.leaderboard import adding
+from hipg_bench.leaderboard.board import Board
+from hipg_bench.leaderboard.playing import Match
+from hipg_bench.leaderboard.rows import pack, parse_rows, unpack
+from hipg_bench.leaderboard.salt import new_salt, read_salt, reveal_salt
+from hipg_bench.leaderboard.shown import read_board
+from hipg_bench.leaderboard.source import opened
+from hipg_bench.leaderboard.verify import verify
+from hipg_bench.paths import data_folder
+from hipg_bench.policies.bundle import load_agent
+from hipg_bench.sandbox import choice
+from hipg_bench.submissions import archive
+
+TASK = "hazard_nav-4"
+MATCH = Match((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
+SHORT = Match((TASK,), ("standard",), episodes=3, threads=1)
+SANDBOXED = any(trial.works for trial in choice.trials().values())
+
+
+def network(folder, name="newcomer"):
+    """A submission of tier 0: trained weights under a card of its own."""
+    (folder / TASK).mkdir(parents=True)
+    (weights,) = (data_folder("agents") / "mappo_minhealth" / TASK).glob("seed*.safetensors")
+    shutil.copyfile(weights, folder / TASK / "seed0.safetensors")
+    shutil.copyfile(weights.with_suffix(".curve.csv"), folder / TASK / "seed0.curve.csv")
+    (folder / "agent.toml").write_text(f'name = "{name}"\nsummary = "Learns"\nkind = "network"\n')
+    (folder / "README.md").write_text("# A newcomer\n")
+    return folder
+
+
+def python(folder, name, answer):
+    """A submission of tier 2."""
+    folder.mkdir()
+    (folder / "agent.toml").write_text(
+        f'name = "{name}"\nsummary = "Acts"\nkind = "python"\nentry_point = "own:make_agent"\n'
+        f"[tasks]\n{TASK!r} = [0]\n"
+    )
+    (folder / "own.py").write_text(
+        "import numpy as np\n"
+        "class Agent:\n"
+        "    def reset(self, seeds): pass\n"
+        f"    def act(self, observation, alive): return {answer}\n"
+        "def make_agent(task, train_seed): return Agent()\n"
+    )
+    return folder
+
+
+def zipped(folder):
+    path = folder.with_suffix(".zip")
+    archive.pack(folder, path)
+    return path
+
+
+def add(board, what, match=MATCH, trust=False, **options):
+    with opened(what, trust=trust) as source:
+        return adding.add(board, source, match, **options).entry
+
+
+@pytest.fixture(scope="module")
+def salted(tmp_path_factory):
+    """A board that is bound to a salt, the salt, and a newcomer's zip, which is on it."""
+    place = tmp_path_factory.mktemp("board")
+    board = Board(place / "board")
+    new_salt(board.root, place / "salt", "hipg-1")
+    package = zipped(network(place / "newcomer"))
+    add(board, package)
+    return board, read_salt(board.root, place / "salt"), package
+
+
+@pytest.fixture
+def board(salted, tmp_path):
+    """A copy of that board for one test."""
+    shutil.copytree(salted[0].root, tmp_path / "board")
+    return Board(tmp_path / "board")
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory, salted):
+    """What the newcomer's own evaluation of six worlds gave, as the command writes it."""
+    place = tmp_path_factory.mktemp("claims")
+    with opened(salted[2]) as source:
+        for split in MATCH.splits:
+            runner.evaluate(source.agent, MATCH.suite(), place / split, MATCH.plan(split))
+    return place
+
+
+def altered(claims, place, change):
+    """Claims in which one row of the standard split is another."""
+    shutil.copytree(claims, place)
+    path = place / "standard" / "episodes" / f"{TASK}.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    change(lines[4])
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return place
+
+
+def test_a_zip_becomes_an_entry(salted):
+    board, _, package = salted
+    (shown,) = read_board(board)
+    assert (shown.status, shown.worlds, shown.kind) == ("self-reported", "public", "checkpoint")
+    assert shown.entry.bundle == hashlib.sha256(package.read_bytes()).hexdigest()
+    assert shown.entry.tier == 0
+    assert shown.readme == "# A newcomer\n"
+    found = shown.rows("public", "standard", TASK)
+    assert [row["world"] for row in found] == list(range(6))
+    # the same rows as the agent plays by itself
+    with opened(package) as source:
+        spec = MATCH.suite().specs[0]
+        own = MATCH.plan("standard").play_all(spec, source.agent.policy(spec, 0))
+    assert [row["return"] for row in found] == [row["return"] for row in own]
+    # a curve is two columns of numbers, thinned, with the last point kept
+    (points,) = shown.curves[TASK].values()
+    assert len(points) <= adding.CURVE_POINTS
+    last = (data_folder("agents") / "mappo_minhealth" / TASK).glob("*.curve.csv")
+    assert points[-1][0] == float(next(last).read_text().splitlines()[-1].split(",")[1])
+    assert not list(board.root.rglob(".work"))
+
+
+def test_what_is_true_is_verified_on_hidden_worlds(board, salted):
+    _, salt, _ = salted
+    found = verify(board, "newcomer", salt, threads=1)
+    assert (found.outcome, found.sandbox, found.execution) == ("verified", "not needed", "decentralised")
+    assert (found.compared, found.differing) == (12, 0)
+    (shown,) = read_board(board)
+    assert (shown.status, shown.worlds) == ("verified", "hidden")
+    for split in MATCH.splits:
+        hidden, public = (shown.rows(worlds, split, TASK) for worlds in ("hidden", "public"))
+        assert [row["eval_seed"] for row in public] == [1000] * 6
+        # nobody learns which worlds they are
+        assert [row["eval_seed"] for row in hidden] == [None] * 6
+        assert {row["return"] for row in hidden}.isdisjoint({row["return"] for row in public})
+        # the seed as the protocol documents it, worked out by hand
+        message = f"hipg-1|{split}|{TASK}|0".encode()
+        inner = hashlib.sha256(bytes(b ^ 0x36 for b in salt.ljust(64, b"\0")) + message).digest()
+        digest = hashlib.sha256(bytes(b ^ 0x5C for b in salt.ljust(64, b"\0")) + inner).digest()
+        assert MATCH.plan(split, salt).eval_seed(TASK, 0) == int.from_bytes(digest[:8], "big") >> 1
+    published = b"".join(
+        unpack(path) if path.suffix == ".gz" else path.read_bytes()
+        for path in board.root.rglob("*") if path.is_file()
+    )  # fmt: skip
+    seed = MATCH.plan("standard", salt).eval_seed(TASK, 0)
+    assert salt.hex().encode() not in published
+    assert str(seed).encode() not in published
+    # verified twice, it is the same entry once, with no history
+    verify(board, "newcomer", salt, threads=1)
+    assert not (board.root / "history").exists()
+
+
+def test_after_the_salt_is_revealed_it_is_outdated(board, salted, tmp_path):
+    _, salt, _ = salted
+    verify(board, "newcomer", salt, threads=1)
+    (tmp_path / "salt").write_text(salt.hex())
+    (tmp_path / "salt").chmod(0o600)
+    reveal_salt(board.root, tmp_path / "salt")
+    assert read_board(board)[0].status == "outdated"
+    with pytest.raises(BoardError, match="not the one"):
+        verify(board, "newcomer", salt, threads=1)
+    new_salt(board.root, tmp_path / "second", "hipg-1")
+    verify(board, "newcomer", read_salt(board.root, tmp_path / "second"), threads=1)
+    assert read_board(board)[0].status == "verified"
+
+
+def test_true_claims_are_verified(tmp_path, salted, rows):
+    board = Board(tmp_path / "board")
+    new_salt(board.root, tmp_path / "salt", "hipg-1")
+    assert add(board, salted[2], claims=rows).claimed
+    found = verify(board, "newcomer", read_salt(board.root, tmp_path / "salt"), threads=1)
+    assert (found.outcome, found.compared) == ("verified", 12)
+
+
+def a_billionth(row):
+    row["return"] += 1e-9
+
+
+def a_life(row):
+    row["survival"], row["deaths"], row["death_list"], row["first_death"] = 1.0, 0, [], None
+
+
+@pytest.mark.parametrize(("change", "field"), [(a_billionth, "return"), (a_life, "survival")])
+def test_a_claim_that_is_a_little_untrue_is_caught(tmp_path, salted, rows, change, field):
+    board = Board(tmp_path / "board")
+    new_salt(board.root, tmp_path / "salt", "hipg-1")
+    add(board, salted[2], claims=altered(rows, tmp_path / "claims", change))
+    found = verify(board, "newcomer", read_salt(board.root, tmp_path / "salt"), threads=1)
+    assert (found.outcome, found.differing) == ("mismatch", 1)
+    (difference,) = found.differences
+    assert (difference.split, difference.task, difference.world) == ("standard", TASK, 4)
+    assert field in difference.fields
+    assert "world 4" in found.reasons[0]
+    # no hidden world was spent on it
+    (shown,) = read_board(board)
+    assert (shown.status, shown.worlds) == ("mismatch", "public")
+    assert not (shown.folder / "hidden").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda row: row.pop("survival"), "survival is nothing"),
+        (lambda row: row.update({"return": "high"}), "return is 'high'; int or float is allowed"),
+        (lambda row: row.update({"return": float("nan")}), "return is nan"),
+        (lambda row: row.update(world=-1), "eval_seed is 1000 there"),
+        (lambda row: row.update(policy="another"), "belongs to another evaluation"),
+        (lambda row: row.update(versions={}), "belongs to another evaluation"),
+    ],
+)
+def test_claims_that_are_no_rows_are_refused_and_leave_nothing(tmp_path, salted, rows, change, message):
+    board = Board(tmp_path / "board")
+    claims = altered(rows, tmp_path / "claims", change)
+    with pytest.raises((BoardError, ResumeError), match=message):
+        add(board, salted[2], claims=claims)
+    assert board.names() == ()
+    assert not list(board.root.glob(".draft*"))
+
+
+def test_what_was_tampered_with_on_the_board_is_not_believed(board, salted):
+    _, salt, _ = salted
+    folder = board.folder("newcomer")
+    path = folder / "standard" / "episodes" / f"{TASK}.jsonl.gz"
+    text = unpack(path)
+    row = parse_rows(text, "")[0]
+    pack(text.replace(json.dumps(row["return"]).encode(), b"0.0"), path)
+    with pytest.raises(BoardError, match="not what was entered"):
+        read_board(board)[0].rows("public", "standard", TASK)
+    assert verify(board, "newcomer", salt, threads=1).outcome == "mismatch"
+    bundle = folder / "bundle.zip"
+    bundle.write_bytes(bundle.read_bytes() + b"\0")
+    with pytest.raises(BoardError, match="not what was entered"):
+        verify(board, "newcomer", salt, threads=1)
+
+
+def test_bundles_that_may_not_be_entries(tmp_path, board):
+    fake = tmp_path / "fake"
+    fake.mkdir()
+    (fake / "agent.toml").write_text('name = "mine"\nsummary = "s"\nbuiltin = "scripted"\n')
+    with pytest.raises(BundleError, match="come with the benchmark"):
+        add(board, fake)
+    with pytest.raises(BundleError, match="belongs to an agent of the benchmark"):
+        add(board, network(tmp_path / "famous", "mappo_minhealth"))
+    with pytest.raises(BoardError, match="has an entry 'newcomer' already"):
+        add(board, network(tmp_path / "again"))
+
+
+def test_replacing_keeps_the_earlier_version(board, tmp_path):
+    entry = add(board, network(tmp_path / "newcomer"), SHORT, replace=True)
+    assert entry.version == 2
+    assert entry.verification is None
+    assert (board.root / "history/newcomer/v1/forced_death/results.json").exists()
+
+
+@pytest.mark.skipif(not SANDBOXED, reason="no sandbox works on this machine")
+def test_code_of_others_is_verified_in_the_sandbox_and_sharing_is_listed(tmp_path, board, salted):
+    _, salt, _ = salted
+    alone = python(tmp_path / "alone", "alone", "np.tanh(observation[..., :3])")
+    shares = python(tmp_path / "shares", "shares", "np.tanh(np.roll(observation[..., :3], 1, axis=1))")
+    for folder, execution in ((alone, "decentralised"), (shares, "centralised")):
+        entry = add(board, zipped(folder), SHORT)
+        assert entry.sandbox == choice.sandbox()
+        found = verify(board, folder.name, salt, threads=1)
+        assert (found.outcome, found.sandbox, found.execution) == ("verified", choice.sandbox(), execution)
+    assert any("acted on more than they observed" in reason for reason in found.reasons)
+
+
+def test_trusted_code_is_never_verified(tmp_path, board, salted):
+    folder = python(tmp_path / "trusted", "trusted", "observation[..., :3] * 0")
+    assert add(board, folder, SHORT, trust=True).sandbox == "none"
+    found = verify(board, "trusted", salted[1], trust=True, threads=1)
+    assert (found.outcome, found.sandbox) == ("unsandboxed", "none")
+    shown = next(one for one in read_board(board) if one.name == "trusted")
+    # its hidden scores are not shown as if they were worth something
+    assert (shown.status, shown.worlds) == ("unsandboxed", "public")
+
+
+def test_references_see_the_joint_state_and_have_no_rank(tmp_path):
+    board = Board(tmp_path)
+    entry = add(board, "scripted", SHORT)
+    assert (entry.bundle, entry.tier, entry.privileged) == (None, None, True)
+    assert read_board(board)[0].kind == "reference"
+
+
+def command(*args):
+    main = "from hipg_bench.cli import main; main()"
+    return [sys.executable, "-c", main, "leaderboard", *map(str, args)]
+
+
+OPTIONS = ("--tasks", TASK, "--splits", "standard", "--films", "none", "--threads", "1", "--board")
+
+
+def test_the_commands_from_a_zip_to_a_page(tmp_path):
+    """What docs/leaderboard.md tells a maintainer, word by word."""
+    board, package = tmp_path / "board", zipped(network(tmp_path / "newcomer"))
+
+    def run(*args):
+        return subprocess.run(command(*args), capture_output=True, text=True, timeout=120)
+
+    salt = tmp_path / "safe" / "salt"
+    assert "now promises" in run("salt", "new", salt, "--board", board).stdout
+    added = run("add", package, "--episodes", 3, *OPTIONS, board)
+    assert "newcomer is on the board, self-reported" in added.stdout, added.stderr
+    again = run("add", package, "--episodes", 3, *OPTIONS, board)
+    assert (again.returncode, again.stdout) == (2, "")
+    assert "has an entry 'newcomer' already" in again.stderr
+    assert "Traceback" not in again.stderr
+    checked = run("verify", "newcomer", "--salt-file", salt, "--board", board)
+    assert checked.returncode == 0, checked.stderr
+    assert "newcomer: verified, decentralised, sandbox not needed" in checked.stdout
+    assert run("build", "--out", tmp_path / "site", "--board", board).returncode == 0
+    assert "newcomer" in (tmp_path / "site" / "index.html").read_text()
+    typo = run("verify", "newcommer", "--salt-file", salt, "--board", board)
+    assert typo.returncode == 2
+    assert "did you mean 'newcomer'?" in typo.stderr
+
+
+def test_adding_is_killed_and_two_add_at_once(tmp_path):
+    board = Board(tmp_path / "board")
+    packages = [zipped(network(tmp_path / name, name)) for name in ("one", "two")]
+    long = subprocess.Popen(
+        command("add", packages[0], "--episodes", 3000, *OPTIONS, board.root), stderr=subprocess.DEVNULL
+    )
+    until = time.monotonic() + 60
+    while not list(board.root.glob(".draft-one-*/.work/standard/episodes/*.jsonl")):
+        assert long.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    os.kill(long.pid, signal.SIGKILL)
+    long.wait()
+    assert board.names() == ()
+    children = [
+        subprocess.Popen(command("add", package, "--episodes", 3, *OPTIONS, board.root))
+        for package in packages
+    ]
+    assert [child.wait(120) for child in children] == [0, 0]
+    assert board.names() == ("one", "two")
+    assert not list(board.root.glob(".draft*"))
+    assert load_agent("zero").name not in board.names()
