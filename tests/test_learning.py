@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hipg_bench import make
-from hipg_bench.errors import ResumeError, SpecError
+from hipg_bench.errors import BundleError, ResumeError, SpecError
 from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.mappo import Trainer, surrogate, value_loss
@@ -185,6 +185,29 @@ def test_a_resumed_run_is_the_same_run(tmp_path: Path) -> None:
     for a, b in zip(*rows, strict=True):
         assert {**a, "seconds": ""} == {**b, "seconds": ""}
     assert json.loads((tmp_path / "cut" / "train.json").read_text())["env_steps"] == 320
+
+
+def test_a_larger_team_starts_from_what_a_smaller_one_learned(tmp_path: Path) -> None:
+    start = Path("agents/mappo_minhealth/hazard_comm-10/seed0.safetensors").resolve()
+    teacher = load_network(start)
+    own = recommended("hazard_comm-16", num_envs=8, rollout=10, start=str(start), critic_hidden=(16,))
+    trainer = Trainer(own)
+    trainer.start_from(start)
+    observation = trainer.step.observation
+    expected, _ = teacher.act(observation, None, trainer.step.info["alive"])
+    mean = trainer.actor(torch.from_numpy(observation)).mean.detach().numpy()
+    np.testing.assert_allclose(mean.clip(-1, 1), expected, atol=2e-5)
+    trainer.iterate()
+    # what is met, 8 worlds x 10 steps x 16 agents, weighs 1 of 21 parts
+    np.testing.assert_allclose(float(trainer.actor.norm.count), 21 * 8 * 10 * 16, rtol=0.05)
+
+
+def test_a_start_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    other = Path("agents/mappo_minhealth/hazard_nav-4/seed0.safetensors").resolve()
+    settings = recommended("hazard_comm-16", num_envs=8, rollout=10, start=str(other))
+    with pytest.raises(BundleError, match=r"observation\.mean"):
+        train(settings, tmp_path, command="test")
+    assert not (tmp_path / "checkpoint.pt").exists()
 
 
 def test_a_trial_is_the_plain_loop_over_the_policy_file(tmp_path: Path) -> None:

@@ -17,21 +17,26 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from safetensors.numpy import load_file
 from safetensors.torch import save_file
 from torch import Tensor
 
 from hipg_bench.env import BatchEnv, Step
+from hipg_bench.errors import BundleError
 from hipg_bench.layout import TaskLayout
 from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
 from hipg_bench.paths import replacing
-from hipg_bench.policies.network import save_network
+from hipg_bench.policies.form import Form
+from hipg_bench.policies.network import load_network, save_network
 from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
 """Bounds of the actor's learning rate."""
+_START_COUNTS = 20
+"""Rollouts that the normalisation of a start weighs."""
 _LOSE_EVERY = 5
 """Steps between two chances of a spontaneous death; each costs another look at all worlds."""
 
@@ -259,6 +264,19 @@ class Trainer:
                 _descend(self.critic_optimizer, loss, settings.max_grad_norm)
                 error += float((value.detach() - aim[part]).square().mean()) / len(parts)
         return {"value_loss": error, "explained": 1 - error / float(aim.var())}
+
+    def start_from(self, path: Path) -> None:
+        """Begin with a policy file's weights.
+
+        Raises:
+            BundleError: it is none, or its network is another than the settings'.
+        """
+        form = load_network(path).form  # nothing in the file is believed before it is checked
+        if form != Form():
+            raise BundleError(f"{path}: {Form()!r} is allowed, got {form!r}")
+        settings = self.settings
+        samples = settings.num_envs * settings.rollout * self.env.num_agents
+        self.actor.adopt(load_file(path), _START_COUNTS * samples)
 
     def save_policy(self, path: Path) -> None:
         """Write the policy file: the mean action's network."""

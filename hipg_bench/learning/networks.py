@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hipg_bench.errors import BundleError
 from hipg_bench.policies.network import CLIP
 
 
@@ -46,6 +48,13 @@ class RunningNorm(nn.Module):
         self.square += x.var(0, unbiased=False) * len(x) + fresh**2 * self.count * len(x) / total
         self.mean += fresh * len(x) / total
         self.count.copy_(total)
+
+    @torch.no_grad()
+    def adopt(self, offset: Float[Tensor, "size"], scale: Float[Tensor, "size"], count: int) -> None:
+        """Start as if ``count`` samples of this mean and scale had been taken in."""
+        self.mean.copy_(offset)
+        self.square.copy_(scale.double() ** 2 * count)
+        self.count.fill_(float(count))
 
     @property
     def offset(self) -> Float[Tensor, "size"]:
@@ -106,6 +115,28 @@ class Actor(nn.Module):
     def distribution(self, normalized: Float[Tensor, "... O"]) -> torch.distributions.Normal:
         """The same of observations that are normalised already."""
         return torch.distributions.Normal(self.body(normalized), self.log_std.exp(), validate_args=False)
+
+    @torch.no_grad()
+    def adopt(self, tensors: Mapping[str, np.ndarray], count: int) -> None:
+        """Take the weights that `tensors` once wrote; exploration's deviation stays as it is.
+
+        Args:
+            tensors: of a network with the same layers.
+            count: samples that the adopted normalisation weighs, beside what is met from now on.
+
+        Raises:
+            BundleError: its layers are others.
+        """
+        own = {name: tensor.shape for name, tensor in self.tensors().items()}
+        theirs = {name: tensor.shape for name, tensor in tensors.items()}
+        if own != theirs:
+            raise BundleError(f"a start must have tensors {own}, got {theirs}")
+        given = {name: torch.from_numpy(tensor) for name, tensor in tensors.items()}
+        self.norm.adopt(given["observation.mean"], given["observation.scale"], count)
+        linears = [layer for layer in self.body if isinstance(layer, nn.Linear)]
+        for k, layer in enumerate(linears):
+            layer.weight.copy_(given[f"layer{k}.weight"])
+            layer.bias.copy_(given[f"layer{k}.bias"])
 
     def tensors(self) -> dict[str, np.ndarray]:
         """What `hipg_bench.policies.network.save_network` writes: the mean action's network."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import platform
@@ -19,7 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from hipg_bench.errors import HipgError
 from hipg_bench.learning import mappo, trial
-from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings
+from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
 from hipg_bench.paths import write_text
 from hipg_bench.policies.network import load_network
 from hipg_bench.registry import task_spec
@@ -100,6 +101,7 @@ def train(
 
     Raises:
         ResumeError: the folder holds a run with other settings.
+        BundleError: ``settings.start`` does not fit.
         HipgError: the learner is built on TorchRL, which is not installed.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -109,6 +111,8 @@ def train(
     if checkpoint.exists():
         learner.resume(checkpoint)
         rows = list(csv.DictReader(io.StringIO(curve.read_text())))[: learner.iteration]
+    elif isinstance(learner, mappo.Trainer) and learner.settings.start:
+        learner.start_from(Path(learner.settings.start))
     before = float(rows[-1]["seconds"]) if rows else 0.0
     worlds = trial.Trial(settings.task, threads=torch.get_num_threads())
     started = time.monotonic()
@@ -168,6 +172,8 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
             "python": platform.python_version(),
         },
     }
+    if isinstance(settings, Settings) and settings.start:
+        content["start_fingerprint"] = hashlib.sha256(Path(settings.start).read_bytes()).hexdigest()[:12]
     if isinstance(settings, MaddpgSettings | QmixSettings):
         content["versions"]["torchrl"] = metadata.version("torchrl")
     return json.dumps(content, indent=2) + "\n"

@@ -82,6 +82,8 @@ class Settings(RunSettings):
         lam: GAE's lambda.
         clip: PPO's epsilon.
         entropy: weight of the entropy bonus.
+        start: policy file whose weights the actor begins with, of any task with the same observations and
+            actions; the critic begins anew. So larger teams go on from what smaller ones learned.
         actor_rate: the actor's first learning rate; it then follows ``target_kl``.
         critic_rate: the critic's learning rate.
         target_kl: the actor's rate is halved above twice this divergence per epoch, raised below half;
@@ -110,6 +112,7 @@ class Settings(RunSettings):
     lam: float = pydantic.Field(default=0.95, ge=0, le=1)
     clip: float = pydantic.Field(default=0.2, gt=0, lt=1)
     entropy: float = pydantic.Field(default=0.002, ge=0, le=1)
+    start: str | None = None
     actor_rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     critic_rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     target_kl: float | None = pydantic.Field(default=0.015, gt=0, le=1)
