@@ -78,6 +78,11 @@ class Sim:
         """B."""
         return self.batch.nsim
 
+    @property
+    def threads(self) -> int:
+        """How many threads run the physics, and may run what else takes long."""
+        return self.batch.nthread
+
     def disable(self, dead: Bool[np.ndarray, "B N"]) -> None:
         """Cut every actuator of dead agents: their groups exert no force, whatever they are told."""
         self._disabled[:] = dead @ (1 << np.arange(dead.shape[1]))

@@ -21,7 +21,7 @@ from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
 from hipg_bench.layout import Block, Layout, TaskLayout
 from hipg_bench.mechanics import coverage, hazards, health, sensing
-from hipg_bench.mechanics.pairs import few
+from hipg_bench.mechanics.few import few
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 

@@ -20,7 +20,7 @@ from hipg_bench.families import paper_particles as particles
 from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import pairs
+from hipg_bench.mechanics import plane
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -113,8 +113,7 @@ class PaperComm(particles.Particles[Snapshot]):
         now.connected = self._connected(now)
         field["connected"][:, 0] = now.connected
         field["connected_steps"][:, 0] += now.connected
-        collisions, _ = self._overlaps(now, was.health > 0)
-        field["collisions"][:, 0] += self._per_world(now, collisions)
+        field["collisions"][:, 0] += now.overlaps[:, 0]
         self._keep(sim, was, now)
         return now
 
@@ -159,7 +158,7 @@ class PaperComm(particles.Particles[Snapshot]):
 
     def _list(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """The direct observation: what the others within range say."""
-        heard = senses.others(np.ascontiguousarray(np.moveaxis(self._links(now), -1, 0)))
+        heard = senses.others(self._links(now))
         return self.layout.observation.pack(
             {
                 "terminated": (now.health == 0)[..., None],
@@ -173,15 +172,19 @@ class PaperComm(particles.Particles[Snapshot]):
             now.health.shape,
         )
 
-    def _count(self, now: Snapshot) -> Float[np.ndarray, "n N K"]:
-        return senses.look(self._look_layout, now, terminal_position=now.point[:, None, :_HAZARD])
+    def _hints(self, now: Snapshot) -> senses.Hints:
+        none = np.zeros((len(now.health), _HAZARD + 1), bool)
+        return senses.Hints(told=now.point[:, :_HAZARD].reshape(-1, 4), shown=none, known=none)
 
-    def _links(self, now: Snapshot) -> Bool[np.ndarray, "N N B"]:
+    def _links(self, now: Snapshot) -> Bool[np.ndarray, "B N N"]:
         """Live agents that hear each other."""
-        one, other = pairs.of_both(now.health > 0)
-        return pairs.table((now.gaps.apart <= self.link_range) & one & other, self.spec.num_agents)
+        gap = now.position[:, None] - now.position[:, :, None]
+        alive = now.health > 0
+        near = np.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2) <= self.link_range
+        return near & alive[:, None] & alive[:, :, None]
 
     def _connected(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
         """Whether live agents link the terminals; terminals do not hear each other."""
-        start, goal = (now.gaps.away[:_HAZARD] <= self.link_range) & (now.health.T > 0)
-        return pairs.linked(self._links(now), start, goal)
+        linked, terminals = np.empty(len(now.health), bool), now.point[:, :_HAZARD].copy()
+        plane.find_links(now.position, now.health > 0, terminals, self.link_range, linked)
+        return linked

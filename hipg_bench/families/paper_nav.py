@@ -20,6 +20,7 @@ from hipg_bench.families import paper_particles as particles
 from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.mechanics import plane
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -46,10 +47,7 @@ class Snapshot(particles.Snapshot):
 
     hazardous: Bool[np.ndarray, "B L"]
     revealed: Bool[np.ndarray, "B L"]  # hazardous, and known to be
-    # once it is known who died
-    gap: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # sum over safe landmarks to an agent, m
-    collision: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # overlapping pairs of the living
-    dead_overlap: Float[np.ndarray, "B"] = dataclasses.field(init=False)  # of a live and a dead agent
+    gap: Float[np.ndarray, "B"]  # sum over safe landmarks to an agent, m; once it is known who died
 
 
 class PaperNav(particles.Particles[Snapshot]):
@@ -100,8 +98,7 @@ class PaperNav(particles.Particles[Snapshot]):
         particles.place(sim, ids, start, half)
         sim.marker[ids, :, :2] = (half * (2 * where - 1)).reshape(-1, points, 2)
         sim.field["hazardous"][ids] = rank.argsort(axis=1) < self.params.hazards
-        world, _, point = self.read(sim, ids).exposed
-        sim.field["revealed"][ids[world], point] = 1
+        sim.field["revealed"][ids] = self.read(sim, ids).exposed.any(axis=1)
 
     def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
         """Positions do not lag behind the physics: they are generalised coordinates."""
@@ -109,20 +106,21 @@ class PaperNav(particles.Particles[Snapshot]):
         return Snapshot(
             hazardous=hazardous,
             revealed=sim.field["revealed"][rows] > 0,
+            gap=np.zeros(len(hazardous)),
             **self._bodies(sim, rows, hazardous),
         )
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
         """A hazard is revealed for good once an agent, dead or alive, is within its radius."""
-        world, _, point = now.exposed
-        now.revealed[world, point] = True
-        both, single = self._overlaps(now, now.health > 0)
-        now.collision, now.dead_overlap = self._per_world(now, both), self._per_world(now, single)
-        now.gap = self._gap(now)
+        now.revealed |= now.exposed.any(axis=1)
+        alive = now.health > 0
+        plane.count_overlaps(now.position, alive, 2 * self.radius, np.empty(alive.shape), now.overlaps)
+        covers = np.ones_like(alive) if self.params.dead_cover else alive
+        plane.sum_gaps(now.position, covers, now.point, ~now.hazardous, self.params.nobody, now.gap)
         field = sim.field
         field["revealed"][:] = now.revealed
         field["past_revealed"][:] = was.revealed
-        field["collisions"][:, 0] += now.collision
+        field["collisions"][:, 0] += now.overlaps[:, 0]
         field["covered"][:, 0] += now.gap
         self._keep(sim, was, now)
         return now
@@ -133,8 +131,10 @@ class PaperNav(particles.Particles[Snapshot]):
         ``distance``: each agent is charged for all safe landmarks, m; ``collision``: pairs of live agents
         that overlap, of which each is charged; ``dead_overlap``: live agents on dead ones.
         """
-        distance = self.spec.num_agents * now.gap
-        return {"distance": distance, "collision": now.collision, "dead_overlap": now.dead_overlap}
+        collision, dead_overlap = now.overlaps.T
+        return {
+            "distance": self.spec.num_agents * now.gap, "collision": collision, "dead_overlap": dead_overlap,
+        }  # fmt: skip
 
     def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
         """Five numbers per agent and landmark: place, velocity, and dead or hazardous."""
@@ -190,31 +190,10 @@ class PaperNav(particles.Particles[Snapshot]):
             now.health.shape,
         )
 
-    def _count(self, now: Snapshot) -> Float[np.ndarray, "n N K"]:
-        hazard = self._nearest_revealed(now)
-        return senses.look(self._look_layout, now, shown=~now.revealed, hazard_position=hazard)
+    def _hints(self, now: Snapshot) -> senses.Hints:
+        nothing = np.empty((len(now.health), 0))
+        return senses.Hints(told=nothing, shown=~now.revealed, known=now.revealed)
 
     def _before(self, now: Snapshot) -> Snapshot:
-        sim, rows = now.source
-        return dataclasses.replace(super()._before(now), revealed=sim.field["past_revealed"][rows] > 0)
-
-    def _nearest_revealed(self, now: Snapshot) -> Float[np.ndarray, "n N 2"]:
-        """Relative position of the nearest revealed hazard, m; zeros before one is known."""
-        found = np.zeros(now.position.shape)
-        if now.revealed.any():
-            (ids,) = np.nonzero(now.revealed.any(axis=1))
-            distance = np.where(now.revealed[ids].T[:, None], now.gaps.away[..., ids], np.inf)
-            found[ids] = now.point[ids[:, None], distance.argmin(axis=0).T] - now.position[ids]
-        return found
-
-    def _gap(self, now: Snapshot) -> Float[np.ndarray, "B"]:
-        """Sum over safe landmarks of the distance to the nearest agent that covers, m."""
-        distance = now.gaps.away
-        if not self.params.dead_cover:
-            distance = np.where(now.health.T > 0, distance, np.inf)
-        nearest = distance.min(axis=1)
-        if not self.params.dead_cover:
-            nearest[np.isinf(nearest)] = self.params.nobody
-        nearest[now.hazardous.T] = 0.0
-        # one after the other: the order in which np.sum adds depends on the number of worlds
-        return np.add.accumulate(nearest, axis=0)[-1]
+        revealed = now.sim.field["past_revealed"][now.rows] > 0
+        return dataclasses.replace(super()._before(now), revealed=revealed)

@@ -18,12 +18,13 @@ import numpy as np
 import pydantic
 from jaxtyping import Bool, Float, Float32, Int
 
+from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker, asset, attach
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import hazards, pairs
+from hipg_bench.mechanics import hazards, plane
 from hipg_bench.mechanics import health as health_law
-from hipg_bench.mechanics.pairs import Contacts, Gaps
+from hipg_bench.mechanics.few import few
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params, TaskSpec
 
@@ -68,10 +69,10 @@ class Snapshot:
     velocity: Float[np.ndarray, "B N 2"]  # m/s; of the dead, the one they died with
     health: Float[np.ndarray, "B N"]
     point: Float[np.ndarray, "B L 2"]  # landmarks, or terminals and the hazard, m
-    gaps: Gaps  # agents to agents, and to points
-    contacts: Contacts  # agents that push each other, if they live
-    exposed: tuple[Int[np.ndarray, "M"], ...]  # world, agent, point: the M cases of an agent in a hazard
-    source: tuple[Sim, Rows]  # from where it was read
+    exposed: Bool[np.ndarray, "B N L"]  # agents in hazards
+    sim: Sim  # from where it was read
+    rows: Rows
+    overlaps: Float[np.ndarray, "B 2"]  # pairs that overlap, of which both live, and of which one does
     look: Float32[np.ndarray, "B N K"] | None = None  # this step's part of the histogram observation
     past_look: Float32[np.ndarray, "B N K"] | None = None  # the previous step's; both counted once only
 
@@ -87,6 +88,7 @@ class Particles(abc.ABC, Generic[S]):
     """
 
     layout: TaskLayout
+    _look_layout: Layout
     causes: tuple[str, ...] = CAUSES
     physics_steps: int = 1
 
@@ -107,14 +109,18 @@ class Particles(abc.ABC, Generic[S]):
         if not alive.all():
             np.copyto(sim.velocity, 0.0, where=np.repeat(~alive, 2, axis=1))
         sim.control[:] = action.reshape(len(action), -1)
-        push = pairs.repulsion(
-            was.contacts, alive, 2 * self.radius, law.contact_stiffness, law.contact_margin
+        push = np.empty(was.position.shape)
+        plane.push_apart(
+            was.position, alive, 2 * self.radius, law.contact_stiffness, law.contact_margin, push
         )
         sim.applied[:] = self._factor * push.reshape(len(action), -1)
 
     def renew(self, sim: Sim, now: S, ids: Int[np.ndarray, "n"], fresh: S) -> S:
-        """Episodes end at the horizon, so that all worlds usually do so together."""
-        return self.read(sim)
+        """Put the fresh worlds into the arrays of the others."""
+        for name, array in vars(now).items():
+            if isinstance(array, np.ndarray):
+                array[ids] = getattr(fresh, name)
+        return now
 
     def harm(self, was: S, now: S) -> Harm:
         """Exposure from hazards, and from every contact of the living."""
@@ -132,10 +138,8 @@ class Particles(abc.ABC, Generic[S]):
         """Points and other agents, listed or counted."""
         if self._direct:
             return self._list(now)
-        now_and_then = np.empty((*now.health.shape, self.layout.observation.size), np.float32)
-        half = now_and_then.shape[-1] // 2
-        now_and_then[..., :half], now_and_then[..., half:] = self._look(now), self._look_back(now)
-        return now_and_then
+        now.look, both = self._see(now, self._look_back(now))
+        return both
 
     @abc.abstractmethod
     def read(self, sim: Sim, rows: Rows = EVERY) -> S:
@@ -146,36 +150,30 @@ class Particles(abc.ABC, Generic[S]):
         """The direct observation."""
 
     @abc.abstractmethod
-    def _count(self, now: S) -> Float[np.ndarray, "n N K"]:
-        """One control step's part of the histogram observation."""
+    def _hints(self, now: S) -> senses.Hints:
+        """What agents are told and shown in the histogram observation."""
 
     def _before(self, now: S) -> S:
         """The control step before, as the rows remember it, as far as its part of the observation needs."""
-        sim, rows = now.source
-        field, shape = sim.field, now.position.shape
-        position = field["past_position"][rows].reshape(shape)
+        field, shape = now.sim.field, now.position.shape
         return dataclasses.replace(
             now,
-            position=position,
-            velocity=field["past_velocity"][rows].reshape(shape),
-            health=field["past_health"][rows],
-            gaps=pairs.gaps(position, now.point),
+            position=field["past_position"][now.rows].reshape(shape),
+            velocity=field["past_velocity"][now.rows].reshape(shape),
+            health=field["past_health"][now.rows],
         )
 
-    def _look(self, now: S) -> Float[np.ndarray, "n N K"]:
-        """This step's part of the histogram observation."""
-        if now.look is None:
-            now.look = self._count(now)
-        return now.look
+    def _see(self, now: S, past: Float32[np.ndarray, "n N K"]) -> tuple[np.ndarray, np.ndarray]:
+        """This step's part of the histogram observation, and the whole of it."""
+        return senses.look(self._look_layout, now, self._hints(now), past, now.sim.threads)
 
-    def _look_back(self, now: S) -> Float[np.ndarray, "n N K"]:
+    def _look_back(self, now: S) -> Float32[np.ndarray, "n N K"]:
         """The previous step's part; where nobody kept it, from what the rows remember; zeros at first."""
         if now.past_look is None:
-            sim, rows = now.source
-            begun = sim.field["elapsed"][rows, 0] > 0
-            now.past_look = np.zeros_like(self._look(now))
+            begun = now.sim.field["elapsed"][now.rows, 0] > 0
+            now.past_look = past = np.zeros((*now.health.shape, self._look_layout.size), np.float32)
             if begun.any():
-                now.past_look[begun] = self._count(self._before(now))[begun]
+                past[begun] = self._see(self._before(now), past)[0][begun]
         return now.past_look
 
     def _bodies(self, sim: Sim, rows: Rows, hazardous: Bool[np.ndarray, "n L"]) -> dict[str, Any]:
@@ -194,18 +192,17 @@ class Particles(abc.ABC, Generic[S]):
             # the dead are seen with the velocity they died with
             np.copyto(velocity, field["velocity"][rows], where=np.repeat(health == 0, 2, axis=1))
         point = sim.marker[rows][..., :2].copy()
-        gaps = pairs.gaps(position, point)
-        where, agent, world = pairs.few(gaps.away < self._law.hazard_radius)
-        harmful = hazardous[world, where]
+        exposed = np.empty((*health.shape, point.shape[1]), bool)
+        plane.find_within(position, point, hazardous, self._law.hazard_radius, exposed)
         return {
             "health": health,
             "position": position,
             "velocity": velocity.reshape(-1, n, 2),
             "point": point,
-            "gaps": gaps,
-            "contacts": pairs.contacts(gaps, 2 * self.radius, self._law.contact_margin),
-            "exposed": (world[harmful], agent[harmful], where[harmful]),
-            "source": (sim, rows),
+            "exposed": exposed,
+            "overlaps": np.zeros((len(health), 2)),  # once it is known who lives
+            "sim": sim,
+            "rows": rows,
         }
 
     def _keep(self, sim: Sim, was: S, now: S) -> None:
@@ -216,39 +213,23 @@ class Particles(abc.ABC, Generic[S]):
             field["past_position"][:] = was.position.reshape(worlds, -1)
             field["past_velocity"][:] = was.velocity.reshape(worlds, -1)
             field["past_health"][:] = was.health
-            now.past_look = self._look(was)
+            now.past_look = was.look
 
     def _burn(self, now: S) -> Float[np.ndarray, "B N"]:
         """Exposure of each agent from the hazards it is in, nats."""
-        world, agent, point = now.exposed
-        if not len(world):
-            return np.zeros(now.health.shape)
-        law = self._law
-        risk = hazards.risk(now.gaps.away[point, agent, world], law.hazard_radius, law.hazard_peak)
-        rate = health_law.hazard_rate(risk, self.spec.control_step / 0.1)
-        whom = world * self.spec.num_agents + agent
-        return np.bincount(whom, rate, now.health.size).reshape(now.health.shape)
+        burn, law = np.zeros(now.health.shape), self._law
+        world, agent, point = few(now.exposed)
+        if len(world):
+            gap = now.point[world, point] - now.position[world, agent]
+            risk = hazards.risk(np.hypot(*gap.T), law.hazard_radius, law.hazard_peak)
+            np.add.at(burn, (world, agent), health_law.hazard_rate(risk, self.spec.control_step / 0.1))
+        return burn
 
     def _crash(self, now: S, alive: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
         """Exposure of each agent from its contacts, nats."""
-        both, _ = self._overlaps(now, alive)
-        if not (self._law.collision_risk and both.any()):
-            return np.zeros(alive.shape)
-        whom = np.concatenate([now.contacts.one[both], now.contacts.other[both]])
-        rate = np.full(len(whom), -np.log1p(-self._law.collision_risk))
-        return np.bincount(whom, rate, alive.size).reshape(alive.shape)
-
-    def _overlaps(
-        self, now: S, alive: Bool[np.ndarray, "B N"]
-    ) -> tuple[Bool[np.ndarray, "M"], Bool[np.ndarray, "M"]]:
-        """Of all contacts, the overlaps of which both live, and those of which one does."""
-        touch, flags = now.contacts.distance < 2 * self.radius, alive.ravel()
-        one, other = flags[now.contacts.one], flags[now.contacts.other]
-        return touch & one & other, touch & (one ^ other)
-
-    def _per_world(self, now: S, which: Bool[np.ndarray, "M"]) -> Float[np.ndarray, "B"]:
-        """How many of the contacts there are in each world."""
-        return np.bincount(now.contacts.world[which], minlength=len(now.health)).astype(np.float64)
+        touching = np.empty(alive.shape)
+        plane.count_overlaps(now.position, alive, 2 * self.radius, touching, now.overlaps)
+        return -np.log1p(-self._law.collision_risk) * touching
 
 
 def deaths_by_cause(sim: Sim, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "n"]]:

@@ -6,13 +6,21 @@ several times faster than with short last axes.
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Bool, Float, Float32
+import functools
 
-from hipg_bench.mechanics.pairs import few, members
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from hipg_bench.mechanics.few import few
 
 _CACHE = 1 << 18
 """Numbers of four bytes that a core's own cache holds, about."""
+
+
+@functools.cache
+def members(num_agents: int) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+    """First and second agent of every pair."""
+    return np.triu_indices(num_agents, 1)
 
 
 def distances(a: Float[np.ndarray, "D P B"], b: Float[np.ndarray, "D Q B"]) -> Float[np.ndarray, "P Q B"]:
