@@ -164,7 +164,7 @@ def test_a_child_that_cannot_start_is_the_hosts_fault(tmp_path):
         ([sys.executable, "-c", "raise SystemExit('no user namespaces')"], "no user namespaces"),
     ):
         with pytest.raises(HostFailure, match=reason):
-            Child(lambda folder, command=command: Start(command, {}), tmp_path, {}, Budget())
+            Child(lambda folder, command=command: Start(command, {}), tmp_path, {}, Budget()).ask({}, [], 9.0)
 
 
 def test_messages_larger_than_a_pipe_pass_both_ways(tmp_path):

@@ -46,6 +46,8 @@ class Session:
 class ForeignPolicy:
     """An agent in a sandboxed child; a fresh one for every call of `initial_state`.
 
+    The next child is started early, to the point where it would load the agent, and waits.
+
     Attributes:
         privileged: it acts on observations.
         sandbox: how the child is locked in: ``bubblewrap``, ``landlock``, or ``none``.
@@ -81,7 +83,8 @@ class ForeignPolicy:
         self.sandbox = choice.NONE if trust else choice.sandbox()
         self._folder = folder
         self._budget = budget
-        self._children: weakref.WeakSet[Child] = weakref.WeakSet()
+        self._playing: weakref.WeakSet[Child] = weakref.WeakSet()
+        self._next: Child | None = None
         layout = registry.family_of(spec).layout
         self._action_size = layout.action.size
         self._setup = {
@@ -107,17 +110,21 @@ class ForeignPolicy:
             AgentFailure: it does not get that far in time.
             HostFailure: the child could not be started.
         """
-        started = time.monotonic()
-        child = Child(choice.BACKENDS[self.sandbox], self._folder, self._setup, self._budget)
-        left = self._budget.start_up - (time.monotonic() - started)
-        child.ask({"do": "reset"}, [agent_seeds(seed, episode_id).tobytes()], left)
-        self._children.add(child)
+        child = self._next or self._child()
+        self._playing.add(child)
+        self._next = None
+        seeds = agent_seeds(seed, episode_id).tobytes()
+        child.ask({"do": "reset"}, [seeds], self._budget.start_up)
+        self._next = self._child()  # Python starts while this one plays
         return Session(child, self._budget.bank)
 
     def close(self) -> None:
-        """End the children that still run; `initial_state` starts another."""
-        for child in self._children:
+        """End the children that play."""
+        for child in self._playing:
             child.kill()
+
+    def _child(self) -> Child:
+        return Child(choice.BACKENDS[self.sandbox], self._folder, self._setup, self._budget)
 
     def act(
         self, observation: Float[np.ndarray, "B N O"], memory: Session, alive: Bool[np.ndarray, "B N"]

@@ -14,7 +14,7 @@ class Budget:
     held to exactly ``soft``, ``hard`` and ``bank``; a batch to no more than its worlds would be one by one.
 
     Attributes:
-        start_up: from the start of the process to its answer to `reset`.
+        start_up: loading the agent, making it, and its `reset`.
         soft: a step of one world, all agents together.
         hard: a step of one world, whatever is in the bank.
         bank: what the steps of one episode may take beyond ``soft``, in all.

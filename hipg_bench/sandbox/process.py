@@ -26,6 +26,7 @@ from hipg_bench.sandbox.inside import wire
 
 _MOST_HEADER = 16 << 10
 _PIPE = 1 << 20
+_START_SECONDS = 60.0
 _CHUNK = 256 << 10
 _SET_PIPE_SIZE = getattr(fcntl, "F_SETPIPE_SZ", 1031)
 
@@ -40,7 +41,7 @@ class Child:
     """
 
     def __init__(self, backend: Backend, folder: Path, setup: Mapping[str, Any], budget: Budget) -> None:
-        """Start it; it waits for its first message when this returns.
+        """Start it. It gets ready by itself; the first `ask` waits until it is.
 
         Args:
             backend: how it is locked in.
@@ -54,6 +55,7 @@ class Child:
         self.words = bytearray()
         self._budget = budget
         self._came = bytearray()
+        self._ready = False
         start = backend(folder)
         try:
             self._process = subprocess.Popen(
@@ -76,10 +78,9 @@ class Child:
         self._poll = select.poll()
         self._poll.register(self._out, select.POLLIN)
         self._poll.register(self._err, select.POLLIN)
-        try:
-            self.ask(start.setup | dict(setup) | {"memory": budget.memory}, (), budget.start_up)
-        except AgentFailure as failure:  # nothing of the agent has run yet
-            raise HostFailure(f"the sandbox could not be started: {failure}") from failure
+        # an empty pipe takes this at once; if the process has ended already, the first `ask` finds out
+        with contextlib.suppress(BrokenPipeError):
+            os.write(self._in, wire.message(start.setup | dict(setup) | {"memory": budget.memory}))
 
     def ask(
         self, header: Mapping[str, Any], parts: Sequence[Part], seconds: float, most: int = 0
@@ -89,13 +90,16 @@ class Child:
         Args:
             header: of the message.
             parts: bytes that follow it.
-            seconds: how long both may take together.
+            seconds: how long both may take together, once the child is locked in.
             most: bytes that may follow the answer's header.
 
         Raises:
             AgentFailure: no answer in time, the end of the process, or an answer that is none. The child
                 is killed.
+            HostFailure: the same before anything of the agent has run.
         """
+        if not self._ready:
+            self._await_start()
         deadline = time.monotonic() + seconds
         size = sum(memoryview(part).nbytes for part in parts)
         try:
@@ -114,6 +118,15 @@ class Child:
         text = bytes(self.words).decode("utf-8", "replace")
         lines = ["".join(c if c.isprintable() else " " for c in line) for line in text.splitlines()]
         return "\n".join(line[:200] for line in lines[-12:])
+
+    def _await_start(self) -> None:
+        """Wait until the child is locked in; that is our time, not the agent's."""
+        try:
+            self._receive(time.monotonic() + _START_SECONDS, 0)
+        except AgentFailure as failure:
+            self.kill()
+            raise HostFailure(f"the sandbox could not be started: {failure}") from failure
+        self._ready = True
 
     def _send(self, parts: Sequence[Part], deadline: float) -> None:
         left = [memoryview(part).cast("B") for part in parts if memoryview(part).nbytes]
