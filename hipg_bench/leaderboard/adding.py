@@ -80,6 +80,9 @@ def add(
         _copy_curves(agent, folder)
         trouble = films.make(agent, match, film_tasks, work, folder, progress)
         policies = {task: agent.train_seeds(task) for task in played_tasks(work / match.splits[0])}
+        privileged = any(
+            agent.policy(task_spec(task), seeds[0]).privileged for task, seeds in policies.items()
+        )
         entry = Entry(
             name=agent.name,
             version=1 if earlier is None else earlier.version + (source.bundle is not None),
@@ -93,10 +96,8 @@ def add(
             },
             claimed=bool(claimed),
             sandbox=source.sandbox,
-            execution=agent.card.execution,
-            privileged=any(
-                agent.policy(task_spec(task), seeds[0]).privileged for task, seeds in policies.items()
-            ),
+            execution="centralised" if privileged else agent.card.execution,
+            privileged=privileged,
             rows=hashes,
         )
         shutil.rmtree(work)

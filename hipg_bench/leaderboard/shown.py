@@ -55,8 +55,8 @@ class Shown:
 
     @property
     def kind(self) -> Literal["reference", "method", "checkpoint"]:
-        """`reference` for who sees the joint state, `method` from five training seeds on."""
-        if self.entry.privileged:
+        """What it is: see `hipg_bench.evaluation.ranking`."""
+        if self.card.kind == "builtin":
             return "reference"
         seeds = [len(seeds) for seeds in self.entry.policies.values()]
         return "method" if min(seeds, default=0) >= 5 else "checkpoint"

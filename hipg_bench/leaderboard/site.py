@@ -97,7 +97,7 @@ def _pages(view: View, out: Path) -> None:
     environment = _environment()
     common: dict[str, Any] = {
         "view": view, "splits": splits.SPLITS, "split_names": SPLIT_NAMES, "status_says": STATUS_SAYS,
-        **_inline("style.css"), **_inline("page.js"),
+        **_inline("style.css"), **_inline("theme.js"), **_inline("page.js"),
     }  # fmt: skip
     seen = pictures.overview(view.panels, view.specs)
     _write(environment, "index.html.j2", out / "index.html", common | seen)

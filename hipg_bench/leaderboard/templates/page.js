@@ -1,14 +1,10 @@
 "use strict";
 // the theme: the reader's system decides until the button is pressed
-const root = document.documentElement;
-const stored = (value) => {
-  try { return value === undefined ? localStorage.getItem("theme") : localStorage.setItem("theme", value); } catch { return null; }
-};
-if (stored()) root.dataset.theme = stored();
 document.getElementById("theme").addEventListener("click", () => {
+  const root = document.documentElement;
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   root.dataset.theme = dark ? "light" : "dark";
-  stored(root.dataset.theme);
+  try { localStorage.setItem("theme", root.dataset.theme); } catch { /* it holds for this page only */ }
 });
 
 // tables: a click on a column sorts by it, a second one turns the order
