@@ -20,6 +20,7 @@ from hipg_bench.cli import (
     evaluate,
     leaderboard,
     media,
+    submit,
     tasks,
     train,
 )
@@ -38,6 +39,7 @@ app.command()(media.video)
 app.command()(media.view)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
+app.add_typer(submit.app, name="submit")
 app.add_typer(leaderboard.app, name="leaderboard")
 app.command()(calibrate.calibrate)
 app.command()(audit.audit)

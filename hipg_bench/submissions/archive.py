@@ -62,11 +62,11 @@ def check_name(name: str) -> None:
     """
     if len(name) > _LONGEST or not _NAME.fullmatch(name) or ".." in name:
         raise BundleError(
-            f"file {name[:80]!r}: names of letters, digits and _ . + - are allowed, in folders at most 5 deep"
+            f"{name[:80]!r}: names of letters, digits and _ . + - are allowed, in folders at most 5 deep"
         )
     if PurePosixPath(name).suffix.lower() not in ENDINGS and PurePosixPath(name).name != "LICENSE":
         raise BundleError(
-            f"file {name!r}: only {' '.join(ENDINGS)} are allowed; write weights as .safetensors or .npz"
+            f"{name!r}: only {' '.join(ENDINGS)} are allowed; write weights as .safetensors or .npz"
         )
 
 

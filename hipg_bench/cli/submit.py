@@ -1,0 +1,106 @@
+"""``hipg-bench submit``: from a trained agent to a file for the leaderboard."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hipg_bench.cli import console
+
+if TYPE_CHECKING:
+    from hipg_bench.submissions.findings import Finding
+
+app = typer.Typer(
+    help="Make, check and pack an agent for the leaderboard: docs/submit.md.", no_args_is_help=True
+)
+
+Folder = Annotated[Path, typer.Argument(help="The agent's folder, with agent.toml.")]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Run its code without a sandbox; only for code of your own.")
+]
+_STYLES = {"error": "bold red", "advice": "yellow", "fine": "green"}
+
+
+@app.command()
+def init(
+    name: Annotated[Path, typer.Argument(help="The agent's name, and its new folder.")],
+    tier: Annotated[
+        int, typer.Option(min=0, max=2, help="0 declared network, 1 ONNX, 2 Python in a sandbox.")
+    ] = 0,
+    authors: Annotated[str, typer.Option(help="Whom to thank.")] = "",
+    license: Annotated[str, typer.Option(help="Such as MIT or Apache-2.0.")] = "",
+    summary: Annotated[str, typer.Option(help="One sentence.")] = "",
+) -> None:
+    """Make a folder to be filled in."""
+    from hipg_bench.submissions.init import init as make
+
+    for path in make(name, tier, authors=authors, license=license, summary=summary):
+        console.out.print(str(path), markup=False, soft_wrap=True)
+    weights = f"{name}/<task>/seed<k>" + (".safetensors", ".onnx", ".npz")[tier]
+    console.out.print(
+        f"next: write {weights}, then: hipg-bench submit check {name}", markup=False, soft_wrap=True
+    )
+
+
+@app.command()
+def check(
+    folder: Folder,
+    trust: Trust = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+) -> None:
+    """Say what would keep an agent from the board, and what to do about it; exit code 1 if anything would."""
+    from hipg_bench.submissions.check import check as look
+
+    found: list[Finding] = []
+    for finding in look(folder, trust=trust):
+        found.append(finding)
+        if not as_json:
+            _print(finding)
+    if as_json:
+        console.show_json([dataclasses.asdict(finding) for finding in found])
+    errors = sum(finding.severity == "error" for finding in found)
+    if errors:
+        if not as_json:
+            console.say(f"\n{errors} error{'s' * (errors > 1)}: it cannot be packed yet")
+        raise typer.Exit(1)
+    if not as_json:
+        console.out.print(f"\nready: hipg-bench submit pack {folder}", markup=False, soft_wrap=True)
+
+
+@app.command()
+def pack(
+    folder: Folder,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The zip; by default <name>.zip here.")
+    ] = None,
+    trust: Trust = False,
+) -> None:
+    """Check an agent and pack it; nothing is written if anything would keep it from the board."""
+    from hipg_bench.submissions.archive import pack as write
+    from hipg_bench.submissions.check import check as look
+
+    findings = [finding for finding in look(folder, trust=trust) if finding.severity != "fine"]
+    for finding in findings:
+        _print(finding)
+    if any(finding.severity == "error" for finding in findings):
+        console.say("\nnot packed")
+        raise typer.Exit(1)
+    target = out or Path(f"{folder.resolve().name}.zip")
+    digest = write(folder, target)
+    console.out.print(
+        f"{target}: {target.stat().st_size} bytes, sha256 {digest}", markup=False, soft_wrap=True
+    )
+
+
+def _print(finding: Finding) -> None:
+    from rich.text import Text
+
+    line = Text.assemble(
+        (f"{finding.severity:<7}", _STYLES[finding.severity]), (finding.where, "bold"), ": ", finding.what
+    )
+    console.out.print(line, soft_wrap=True)
+    if finding.remedy:
+        console.out.print(Text(f"        {finding.remedy}", "dim"), soft_wrap=True)
