@@ -18,6 +18,7 @@ from hipg_bench.cli import (
     collect,
     doctor,
     evaluate,
+    figures,
     leaderboard,
     media,
     submit,
@@ -35,6 +36,7 @@ app = typer.Typer(
 app.command()(evaluate.evaluate)
 app.command()(train.train)
 app.command()(collect.collect)
+app.command()(figures.figures)
 app.command()(media.video)
 app.command()(media.view)
 app.add_typer(tasks.app, name="tasks")

@@ -1,0 +1,101 @@
+"""What the bundles say of each training run: how it learned, and what it reached."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hipg_bench.comparison.artefacts import BUNDLES
+from hipg_bench.registry import tasks
+from hipg_bench.spec import TaskSpec
+
+_BLOCKS = 30
+"""Points of a drawn curve at most; each is a mean over neighbours, as in the paper."""
+_END = 0.1
+"""Share of a run whose mean stands for what it reached, where no score was measured."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """A training run.
+
+    Attributes:
+        arm: min_health, central, ..., with ``-<label>`` for a variant.
+        task: its name.
+        seed: of the training.
+        steps: (K,) environment steps, rising.
+        score: (K,) there, 0 as random actions and 1 as the reference.
+        tried: scores are of trials without exploration; else of the training's own episodes, with
+            exploration and the weights of training.
+        final: what the last policy reached by the standard protocol; else the mean of the last tenth.
+    """
+
+    arm: str
+    task: str
+    seed: int
+    steps: Float[np.ndarray, "K"]
+    score: Float[np.ndarray, "K"]
+    tried: bool
+    final: float
+
+    def between(self, start: float, end: float) -> float:
+        """Mean score from one share of the run's steps to another; NaN where there is no point."""
+        share = self.steps / self.steps[-1]
+        inside = self.score[(share > start) & (share <= end)]
+        return float(inside.mean()) if len(inside) else float("nan")
+
+
+def traces(agents: Path) -> list[Trace]:
+    """Read all curves of bundles that are arms of the comparison, on tasks that have a score."""
+    found: list[Trace] = []
+    for folder in sorted(agents.glob("*/")):
+        arm = _arm(folder.name)
+        for path in sorted(folder.glob("*/seed*.curve.csv")) if arm is not None else ():
+            spec, seed = tasks().get(path.parent.name), re.match(r"seed(\d+)\.", path.name)
+            if arm is not None and spec is not None and spec.anchors is not None and seed is not None:
+                found += _read(path, arm, spec, int(seed[1]))
+    return found
+
+
+def blocks(
+    steps: Float[np.ndarray, "K"], score: Float[np.ndarray, "K"], most: int = _BLOCKS
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    """Means over runs of neighbours, so that at most so many points are left."""
+    parts = np.array_split(np.arange(len(steps)), min(most, len(steps)))
+    return np.array([steps[part].mean() for part in parts]), np.array([score[part].mean() for part in parts])
+
+
+def _arm(bundle: str) -> str | None:
+    """The arm, with its label, that a bundle's name stands for."""
+    for arm, name in BUNDLES.items():
+        if bundle == name:
+            return arm
+        if bundle.startswith(f"{name}_"):
+            return f"{arm}-{bundle[len(name) + 1 :]}"
+    return None
+
+
+def _read(path: Path, arm: str, spec: TaskSpec, seed: int) -> Iterator[Trace]:
+    """The run of a curve, if anything was measured."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    scores = [(float(row["steps"]), float(row["score"])) for row in rows if row.get("score")]
+    tried = len(scores) > 1
+    if not tried:
+        scores = [
+            (float(row["steps"]), spec.score(float(row["return"]))) for row in rows if row.get("return")
+        ]
+    if not scores:
+        return
+    steps, score = np.array(scores).T
+    record = json.loads(path.with_name(f"seed{seed}.json").read_text(encoding="utf-8"))
+    final = record.get("result", {}).get("score")
+    last = score[steps > (1 - _END) * steps[-1]].mean()
+    yield Trace(arm, spec.task, seed, steps, score, tried, float(last if final is None else final))
