@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csgraph
 from scipy.spatial import distance as scipy_distance
@@ -86,23 +86,6 @@ def test_nearest_by_a_plain_loop(seed: int, agents: int, nobody: float):
             assert ours[p, b] == best
 
 
-@pytest.mark.parametrize("cache", [1, 40, coverage._CACHE])
-@given(seed=SEEDS, agents=st.integers(1, 6), cap=st.floats(0.05, 3))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_nearest_other_by_a_plain_loop(
-    seed: int, agents: int, cap: float, cache: int, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(coverage, "_CACHE", cache)
-    rng = np.random.default_rng(seed)
-    distance, counts = rng.uniform(0, 2, (agents, 5, 4)), rng.random((agents, agents, 4)) < 0.6
-    ours = coverage.nearest_other(distance, counts, cap)
-    for i in range(agents):
-        for p in range(5):
-            for b in range(4):
-                known = [distance[j, p, b] for j in range(agents) if counts[i, j, b]]
-                assert ours[i, p, b] == np.float32(min([cap, *known]))
-
-
 @given(SEEDS, st.integers(2, 7), st.floats(0.05, 1.5))
 def test_contacts_by_a_plain_loop(seed: int, agents: int, reach: float):
     place, counts = places(seed, agents), np.random.default_rng(seed).random((agents, 3)) < 0.7
@@ -116,53 +99,71 @@ def test_contacts_by_a_plain_loop(seed: int, agents: int, reach: float):
         assert ours[b] == pairs
 
 
-def expect(sensed: sensing.Sensed, agent: int, world: int, others: list[int], worlds: int) -> None:
-    """The slots hold ``others``, nearest first, as far as there is room, and then the agent itself."""
-    slots = len(sensed.seen)
-    others = others[:slots]
-    empty = slots - len(others)
-    assert sensed.seen[:, agent, world].tolist() == [True] * len(others) + [False] * empty
-    held = [other * worlds + world for other in others + [agent] * empty]
-    assert sensed.place[:, agent, world].tolist() == held
+def relative(table: np.ndarray, of: int, to: int, world: int) -> list[float]:
+    return (table[:, of, world] - table[:, to, world]).astype(np.float32).tolist()
 
 
 @given(SEEDS, st.integers(2, 31), st.floats(0.1, 2), st.data())
+@settings(deadline=None)  # compiled when first called
 def test_sensing_by_a_plain_loop(seed: int, agents: int, radius: float, data: st.DataObject):
-    few, many = data.draw(st.integers(1, agents)), data.draw(st.integers(1, agents))
-    place, first = places(seed, agents), np.random.default_rng(seed).random((agents, 3)) < 0.3
-    apart = coverage.apart(place)
-    all_alike = sensing.nearest_within(apart, radius, many)
-    of_first, of_rest = sensing.nearest_of_two_kinds(apart, first, radius, (few, many))
+    slots, wrecks = data.draw(st.integers(1, agents)), data.draw(st.integers(0, agents))
+    rng, place, velocity = np.random.default_rng(seed), places(seed, agents), places(seed + 1, agents)
+    health = (rng.random((3, agents)) < 0.7) * rng.uniform(0.1, 1, (3, agents))
+    team = (coverage.apart(place), radius, health, velocity, place)
+    seen = np.full((3, agents, 1 + 8 * slots + 4 * wrecks), np.nan, np.float32)
+    sensing.write_team(0, 2, *team, seen, 1, slots, wrecks)
+    assert np.isnan(seen[2]).all(), "not asked for"
+    sensing.write_team(2, 3, *team, seen, 1, slots, wrecks)
+    assert np.isnan(seen[..., 0]).all(), "of others"
     for b in range(3):
         for i in range(agents):
-            near = sorted(
+            order = sorted(
                 (math.dist(place[:, i, b], place[:, j, b]), j)
                 for j in range(agents)
                 if j != i and math.dist(place[:, i, b], place[:, j, b]) <= radius
             )
-            expect(all_alike, i, b, [j for _, j in near], 3)
-            expect(of_first, i, b, [j for _, j in near if first[j, b]], 3)
-            expect(of_rest, i, b, [j for _, j in near if not first[j, b]], 3)
+            near = [j for _, j in order if health[b, j] > 0 or not wrecks][:slots]
+            lost = [j for _, j in order if health[b, j] == 0][:wrecks]
+            free = slots - len(near)
+            expected = [1.0] * len(near) + [0.0] * free
+            expected += [float(np.float32(health[b, j])) for j in near] + [0.0] * free
+            for table in (place, velocity):
+                expected += [x for j in near for x in relative(table, j, i, b)] + [0.0] * 3 * free
+            expected += [1.0] * len(lost) + [0.0] * (wrecks - len(lost))
+            expected += [x for j in lost for x in relative(place, j, i, b)] + [0.0] * 3 * (wrecks - len(lost))
+            assert seen[b, i, 1:].tolist() == expected
+
+
+@given(SEEDS, st.integers(1, 9), st.integers(1, 9), st.floats(0.1, 2))
+@settings(deadline=None)  # compiled when first called
+def test_points_by_a_plain_loop(seed: int, agents: int, points: int, radius: float):
+    rng, place, point = np.random.default_rng(seed), places(seed, agents), places(seed + 1, points)
+    health, revealed = (rng.random((3, agents)) < 0.7) * 1.0, rng.random((points, 3)) < 0.3
+    away, apart = coverage.distances(place, point), coverage.apart(place)
+    seen = np.full((3, agents, 5 * points), np.nan, np.float32)
+    sensing.write_points(0, 3, away, apart, radius, health, place, point, revealed, seen, 0)
+    for b in range(3):
+        for i in range(agents):
+            order = sorted(range(points), key=lambda k: math.dist(place[:, i, b], point[:, k, b]))
+            expected = [
+                float(np.float32(point[axis, k, b] - place[axis, i, b])) for k in order for axis in range(3)
+            ]
+            expected += [float(revealed[k, b]) for k in order]
+            for k in order:
+                known = [
+                    away[j, k, b]
+                    for j in range(agents)
+                    if j != i and health[b, j] > 0 and apart[i, j, b] <= radius
+                ]
+                expected.append(float(np.float32(min([radius, *known]))))
+            assert seen[b, i].tolist() == expected
 
 
 def test_things_at_the_same_distance_go_by_number():
-    distance = np.array([3.0, 1.0, 2.0, 1.0, 2.0, 0.0])[None, :, None]
-    assert sensing.nearest(distance, 6)[:, 0, 0].tolist() == [5, 1, 3, 2, 4, 0]
-
-
-@given(SEEDS, st.integers(1, 31), st.integers(1, 31), st.data())
-def test_looking_up_by_a_plain_loop(seed: int, agents: int, things: int, data: st.DataObject):
-    slots = data.draw(st.integers(1, things))
-    rng = np.random.default_rng(seed)
-    distance, shared = rng.uniform(0, 40, (agents, things, 3)), rng.normal(size=(2, things, 3))
-    own = rng.normal(size=distance.shape)
-    nearest = sensing.nearest(distance, slots)
-    found, found_own = sensing.look_up(shared, nearest), sensing.look_up_own(own, nearest)
-    for b in range(3):
-        for i in range(agents):
-            order = sorted(range(things), key=lambda m: distance[i, m, b])[:slots]
-            assert found[:, :, i, b].tolist() == shared[:, order, b].tolist()
-            assert found_own[:, i, b].tolist() == own[i, order, b].tolist()
+    order, distance = np.empty(6, np.int64), np.empty(6)
+    assert sensing.rank_within(np.array([3.0, 1.0, 2.0, 1.0, 2.0, 0.0]), 2.0, order, distance) == 5
+    assert order[:5].tolist() == [5, 1, 3, 2, 4]
+    assert distance[:5].tolist() == [0.0, 1.0, 1.0, 2.0, 2.0]
 
 
 def test_risk_is_the_published_law():

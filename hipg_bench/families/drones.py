@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.families.scene import asset, attach
 from hipg_bench.layout import Block, Layout
-from hipg_bench.mechanics import coverage, sensing
+from hipg_bench.mechanics import coverage
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params, TaskSpec
 
@@ -96,6 +96,13 @@ def living(health: Float[np.ndarray, "n N"]) -> Bool[np.ndarray, "N n"]:
     return health.T.copy() > 0
 
 
+def replace(now: object, ids: Int[np.ndarray, "n"], fresh: object) -> None:
+    """Replace some worlds of a snapshot, in which all arrays but health have the worlds last."""
+    for name, array in vars(now).items():
+        if isinstance(array, np.ndarray) and hasattr(fresh, name):
+            array[ids if name == "health" else (..., ids)] = getattr(fresh, name)
+
+
 def spread(
     chance: Float[np.ndarray, "n C P 3"], low: tuple[float, float, float], high: tuple[float, float, float]
 ) -> Float[np.ndarray, "n P 3"]:
@@ -107,38 +114,13 @@ def spread(
 
 
 def neighbor_blocks(slots: int, visible: str) -> tuple[Block, ...]:
-    """Observation blocks filled by `neighbors`."""
+    """Observation blocks filled by `sensing.write_team`."""
     return (
         Block("neighbor_seen", (slots,), "1", "-", visible),
         Block("neighbor_health", (slots,), "1", "-", visible),
         Block("neighbor_position", (slots, 3), "m", "own", visible),
         Block("neighbor_velocity", (slots, 3), "m/s", "own", visible),
     )
-
-
-def neighbors(
-    sensed: sensing.Sensed,
-    position: Float[np.ndarray, "3 N n"],
-    velocity: Float[np.ndarray, "3 N n"],
-    health: Float[np.ndarray, "n N"],
-) -> dict[str, np.ndarray]:
-    """What each drone perceives of those that it senses: the blocks of `neighbor_blocks`, worlds last."""
-    place, seen = sensed
-    return {
-        "neighbor_seen": seen,
-        "neighbor_health": sensing.look_up(health.T[None], place)[0] * seen,
-        "neighbor_position": relative(position, place, position),
-        "neighbor_velocity": relative(velocity, place, velocity),
-    }
-
-
-def relative(
-    table: Float[np.ndarray, "3 M n"], place: Int[np.ndarray, "K N n"], own: Float[np.ndarray, "3 N n"]
-) -> Float[np.ndarray, "K 3 N n"]:
-    """What fills each drone's slots, relative to its own."""
-    found = sensing.look_up(table, place)
-    found -= own[:, None]
-    return found.swapaxes(0, 1)
 
 
 def pack(

@@ -21,6 +21,7 @@ from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
 from hipg_bench.layout import Block, Layout, TaskLayout
 from hipg_bench.mechanics import coverage, hazards, health, radio, sensing
+from hipg_bench.native import on_threads
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -57,6 +58,7 @@ class Snapshot:
     position: Float[np.ndarray, "3 N B"]  # m
     velocity: Float[np.ndarray, "3 N B"]  # m/s
     health: Float[np.ndarray, "B N"]
+    threads: int
     terminal: Float[np.ndarray, "3 2 B"]  # m
     hazard: Float[np.ndarray, "3 1 B"]  # m
     apart: Float[np.ndarray, "N N B"]  # drone to drone, infinite to oneself, m
@@ -138,9 +140,10 @@ class HazardComm:
         """Positions do not lag behind the physics: they are generalised coordinates."""
         position, velocity = drones.kinematics(sim, self.spec.num_agents, rows)
         marker = sim.marker[rows].T.copy()
-        terminal, health = marker[:, :_HAZARD], sim.field["health"][rows].copy()
+        terminal, health = marker[:, :_HAZARD].copy(), sim.field["health"][rows].copy()
         apart, away = coverage.apart(position), coverage.distances(terminal, position)
         return Snapshot(
+            threads=sim.threads,
             position=position,
             velocity=velocity,
             health=health,
@@ -152,8 +155,9 @@ class HazardComm:
         )
 
     def renew(self, sim: Sim, now: Snapshot, ids: Int[np.ndarray, "n"], fresh: Snapshot) -> Snapshot:
-        """Episodes end at the horizon, so that all worlds usually do so together."""
-        return self.read(sim)
+        """Put the fresh worlds into the arrays of the others."""
+        drones.replace(now, ids, fresh)
+        return now
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from the hazard."""
@@ -189,23 +193,22 @@ class HazardComm:
 
     def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """Own motion exactly, both terminals, own routes, nearby live drones and nearby wrecks."""
-        wrecks, neighbors = sensing.nearest_of_two_kinds(
-            now.apart, ~drones.living(now.health), self.params.sensing_radius, (self._wrecks, self._slots)
-        )
-        return drones.pack(
-            self.layout.observation,
-            {
-                "health": now.health.T,
-                "velocity": now.velocity,
-                "position": now.position,
-                "terminal_position": now.terminal.swapaxes(0, 1)[:, :, None] - now.position,
-                "route": now.hops[:, 2:] >= 0,
-                **drones.neighbors(neighbors, now.position, now.velocity, now.health),
-                "wreck_seen": wrecks.seen,
-                "wreck_position": drones.relative(now.position, wrecks.place, now.position),
-            },
-            now.health.shape,
-        )
+        start = {name: columns.start for name, columns in self.layout.observation.slices.items()}
+        seen = np.empty((*now.health.shape, self.layout.observation.size), np.float32)
+
+        def see(part: slice) -> None:
+            worlds = part.start, part.stop
+            sensing.write_own(*worlds, now.health, now.velocity, now.position, seen)
+            sensing.write_routes(
+                *worlds, now.terminal, now.hops, now.position, seen, start["terminal_position"]
+            )
+            sensing.write_team(
+                *worlds, now.apart, self.params.sensing_radius, now.health, now.velocity, now.position,
+                seen, start["neighbor_seen"], self._slots, self._wrecks,
+            )  # fmt: skip
+
+        on_threads(see, len(seen), now.threads)
+        return seen
 
     def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
         """Everything, the hidden hazard included."""

@@ -22,6 +22,7 @@ from hipg_bench.families.scene import add_marker
 from hipg_bench.layout import Block, Layout, TaskLayout
 from hipg_bench.mechanics import coverage, hazards, health, sensing
 from hipg_bench.mechanics.few import few
+from hipg_bench.native import on_threads
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -56,6 +57,7 @@ class Snapshot:
     position: Float[np.ndarray, "3 N B"]  # m
     velocity: Float[np.ndarray, "3 N B"]  # m/s
     health: Float[np.ndarray, "B N"]
+    threads: int
     point: Float[np.ndarray, "3 P B"]  # m
     hazardous: Bool[np.ndarray, "P B"]
     revealed: Bool[np.ndarray, "P B"]  # hazardous, and known to be
@@ -139,20 +141,22 @@ class HazardNav:
         hazardous = sim.field["hazardous"][rows].T > 0
         distance = coverage.distances(position, point)
         return Snapshot(
+            threads=sim.threads,
             position=position,
             velocity=velocity,
             health=sim.field["health"][rows].copy(),
             point=point,
             hazardous=hazardous,
-            revealed=sim.field["revealed"][rows].T > 0,
+            revealed=sim.field["revealed"][rows].T.copy() > 0,
             distance=distance,
             apart=coverage.apart(position),
             exposed=few((distance < self.params.hazard_radius) & hazardous),
         )
 
     def renew(self, sim: Sim, now: Snapshot, ids: Int[np.ndarray, "n"], fresh: Snapshot) -> Snapshot:
-        """Episodes end at the horizon, so that all worlds usually do so together."""
-        return self.read(sim)
+        """Put the fresh worlds into the arrays of the others."""
+        drones.replace(now, ids, fresh)
+        return now
 
     def harm(self, was: Snapshot, now: Snapshot) -> Harm:
         """Exposure from every hazard within reach."""
@@ -187,24 +191,24 @@ class HazardNav:
 
     def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
         """Own motion exactly, all points, and the nearest drones within the sensing radius."""
+        start = {name: columns.start for name, columns in self.layout.observation.slices.items()}
+        seen = np.empty((*now.health.shape, self.layout.observation.size), np.float32)
         radius = self.params.sensing_radius
-        points = sensing.nearest(now.distance, self.spec.num_agents)
-        sensed = (now.apart <= radius) & drones.living(now.health)
-        taken = coverage.nearest_other(now.distance, sensed, radius)
-        neighbors = sensing.nearest_within(now.apart, radius, self._slots)
-        return drones.pack(
-            self.layout.observation,
-            {
-                "health": now.health.T,
-                "velocity": now.velocity,
-                "position": now.position,
-                "point_position": drones.relative(now.point, points, now.position),
-                "point_hazardous": sensing.look_up(now.revealed[None], points)[0],
-                "point_gap": sensing.look_up_own(taken, points),
-                **drones.neighbors(neighbors, now.position, now.velocity, now.health),
-            },
-            now.health.shape,
-        )
+
+        def see(part: slice) -> None:
+            worlds = part.start, part.stop
+            sensing.write_own(*worlds, now.health, now.velocity, now.position, seen)
+            sensing.write_points(
+                *worlds, now.distance, now.apart, radius, now.health, now.position, now.point, now.revealed,
+                seen, start["point_position"],
+            )  # fmt: skip
+            sensing.write_team(
+                *worlds, now.apart, radius, now.health, now.velocity, now.position,
+                seen, start["neighbor_seen"], self._slots, 0,
+            )  # fmt: skip
+
+        on_threads(see, len(seen), now.threads)
+        return seen
 
     def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
         """Everything, the hidden hazards included."""

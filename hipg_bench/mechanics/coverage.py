@@ -9,12 +9,9 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
 from hipg_bench.mechanics.few import few
-
-_CACHE = 1 << 18
-"""Numbers of four bytes that a core's own cache holds, about."""
 
 
 @functools.cache
@@ -51,27 +48,6 @@ def nearest(
     """
     barrier = np.where(counts, 0.0, np.inf)
     return np.minimum.reduce(distance + barrier[:, None], axis=0, initial=nobody)
-
-
-def nearest_other(
-    distance: Float[np.ndarray, "N P B"], counts: Bool[np.ndarray, "N N B"], cap: float
-) -> Float32[np.ndarray, "N P B"]:
-    """Distance from each point to the nearest other agent, as far as each agent knows.
-
-    Args:
-        distance: from agents to points, m.
-        counts: whether the agent of the first axis knows of the one of the second.
-        cap: the most that is ever returned, also when none is known, m.
-    """
-    # in the precision of observations from the start: rounding keeps the order, so the nearest stays the same
-    reach, barrier = distance.astype(np.float32), ~counts * np.float32(cap)
-    best = np.empty_like(reach)
-    # as many agents at a time as fit in a core's cache
-    some = max(1, _CACHE // reach.size)
-    for i in range(0, len(reach), some):
-        known = np.maximum(reach, barrier[i : i + some, :, None])
-        np.minimum.reduce(known, axis=1, initial=np.float32(cap), out=best[i : i + some])
-    return best
 
 
 def contacts(

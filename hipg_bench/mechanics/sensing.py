@@ -1,125 +1,177 @@
-"""What agents perceive of the things around them: the nearest few, within a radius.
+"""What drones perceive of the things around them, as compiled loops that write observations.
 
-Arrays run along the worlds, B last, as in `hipg_bench.mechanics.coverage`. What fills a slot is told by
-its place in a flat table of M things by B worlds, which is ``B * thing + world``.
+Tables have the worlds last, observations have them first. What falls into a drone's slots is nearest first,
+and things as far as each other go by number; empty slots hold zeros.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8, Shaped
+from jaxtyping import Bool, Float, Float32, Int, Int8
 
-_FRONT = np.iinfo(np.int64).min
-"""The sign bit: a number that has it sorts before all that do not."""
-
-
-class Sensed(NamedTuple):
-    """The K other agents that fill each agent's slots, nearest first."""
-
-    place: Int[np.ndarray, "K N B"]
-    """Who fills the slot; of an empty slot, oneself, from whom nothing differs."""
-    seen: Bool[np.ndarray, "K N B"]
-    """Whether the slot is filled."""
+from hipg_bench.native import compiled
 
 
-def nearest(distance: Float[np.ndarray, "N M B"], slots: int) -> Int[np.ndarray, "K N B"]:
-    """Fill each agent's slots with the places of the things nearest to it.
-
-    Args:
-        distance: from agents to things, m. Things as far as each other, to one part in 10^13, go by number.
-        slots: K, at most M.
-    """
-    return _place(_ranking(distance, slots), distance.shape[2])
-
-
-def nearest_within(distance: Float[np.ndarray, "N N B"], radius: float, slots: int) -> Sensed:
-    """Fill each agent's slots with the nearest others within ``radius`` m.
-
-    Args:
-        distance: between agents, infinite to oneself and to those that cannot be sensed, m.
-        radius: sensing radius, m.
-        slots: K, at most N.
-    """
-    return _fill(_ranking(distance, slots), _count(distance <= radius))
+@compiled
+def write_own(
+    first: int,
+    last: int,
+    health: Float[np.ndarray, "B N"],
+    velocity: Float[np.ndarray, "3 N B"],
+    position: Float[np.ndarray, "3 N B"],
+    out: Float32[np.ndarray, "B N O"],
+) -> None:
+    """Write each drone's own health, velocity and position, with which its observation begins."""
+    for world in range(first, last):
+        for i in range(health.shape[1]):
+            out[world, i, 0] = health[world, i]
+            for axis in range(3):
+                out[world, i, 1 + axis] = velocity[axis, i, world]
+                out[world, i, 4 + axis] = position[axis, i, world]
 
 
-def nearest_of_two_kinds(
-    distance: Float[np.ndarray, "N N B"],
-    first: Bool[np.ndarray, "N B"],
+@compiled
+def write_team(
+    first: int,
+    last: int,
+    apart: Float[np.ndarray, "N N B"],
     radius: float,
-    slots: tuple[int, int],
-) -> tuple[Sensed, Sensed]:
-    """Do as `nearest_within` for agents of two kinds, each with slots of its own, at the price of one sort.
+    health: Float[np.ndarray, "B N"],
+    velocity: Float[np.ndarray, "3 N B"],
+    position: Float[np.ndarray, "3 N B"],
+    out: Float32[np.ndarray, "B N O"],
+    column: int,
+    slots: int,
+    wrecks: int,
+) -> None:
+    """Write the nearest other drones within a radius, each kind into slots of its own.
 
     Args:
-        distance: between agents, infinite to oneself, m.
-        first: the agents of the first kind.
+        first: world to begin with.
+        last: world to end before.
+        apart: between drones, infinite to oneself, m.
         radius: sensing radius, m.
-        slots: for the first kind and for the rest, each at most N.
+        health: in [0, 1].
+        velocity: m/s.
+        position: m.
+        out: written into: for the neighbours who is there, health, relative position and velocity; then
+            for the wrecks who is there and relative position.
+        column: where that begins.
+        slots: how many neighbours at most.
+        wrecks: how many of the dead at most; where it is 0, the dead are neighbours like the others.
     """
-    things, agents, worlds = distance.shape
-    ranking = _ranking(distance, things, first)
-    near = distance <= radius
-    count = _count(near & first)
-    # the rest begin where the first kind ends
-    rank = np.minimum(np.arange(slots[1])[:, None] + first.sum(axis=0), things - 1)
-    row = np.arange(agents * worlds).reshape(agents, worlds)
-    rest = ranking.reshape(-1).take(rank[:, None] * (agents * worlds) + row)
-    return _fill(ranking[: slots[0]], count), _fill(rest, _count(near) - count)
+    agents = health.shape[1]
+    nearest, distance = np.empty(agents, np.int64), np.empty(agents)
+    places = column + 2 * slots
+    speeds, seen_wrecks = places + 3 * slots, column + 8 * slots
+    for world in range(first, last):
+        for i in range(agents):
+            row = out[world, i]
+            row[column : seen_wrecks + 4 * wrecks] = 0.0
+            count = rank_within(apart[i, :, world], radius, nearest, distance)
+            near, lost = 0, 0
+            for j in nearest[:count]:
+                if wrecks and health[world, j] == 0:
+                    if lost < wrecks:
+                        row[seen_wrecks + lost] = 1.0
+                        for axis in range(3):
+                            gap = position[axis, j, world] - position[axis, i, world]
+                            row[seen_wrecks + wrecks + 3 * lost + axis] = gap
+                        lost += 1
+                elif near < slots:
+                    row[column + near] = 1.0
+                    row[column + slots + near] = health[world, j]
+                    for axis in range(3):
+                        gap = position[axis, j, world] - position[axis, i, world]
+                        row[places + 3 * near + axis] = gap
+                        row[speeds + 3 * near + axis] = velocity[axis, j, world] - velocity[axis, i, world]
+                    near += 1
 
 
-def look_up(
-    table: Shaped[np.ndarray, "C M B"], place: Int[np.ndarray, "K N B"]
-) -> Shaped[np.ndarray, "C K N B"]:
-    """Look up what fills the slots in a table of C numbers for each thing."""
-    return table.reshape(len(table), -1).take(place, axis=1)
+@compiled
+def write_points(
+    first: int,
+    last: int,
+    away: Float[np.ndarray, "N P B"],
+    apart: Float[np.ndarray, "N N B"],
+    radius: float,
+    health: Float[np.ndarray, "B N"],
+    position: Float[np.ndarray, "3 N B"],
+    point: Float[np.ndarray, "3 P B"],
+    revealed: Bool[np.ndarray, "P B"],
+    out: Float32[np.ndarray, "B N O"],
+    column: int,
+) -> None:
+    """Write all points, nearest first: where they are, whether they are known to kill, and who is there.
 
-
-def look_up_own(
-    table: Shaped[np.ndarray, "N M B"], place: Int[np.ndarray, "K N B"]
-) -> Shaped[np.ndarray, "K N B"]:
-    """Look up what fills the slots in each agent's own table, of one number for each thing."""
-    start = np.arange(0, table.size, table[0].size)
-    return table.reshape(-1).take(place + start[:, None])
-
-
-def _ranking(
-    distance: Float[np.ndarray, "N M B"], slots: int, first: Bool[np.ndarray, "M B"] | None = None
-) -> Int8[np.ndarray, "K N B"]:
-    """Numbers of the nearest things, nearest first, those of the ``first`` kind before all others.
-
-    Read as integers, the bits of distances sort as these do. The lowest bits give way to the number of the
-    thing, so that one plain sort, several times faster than a stable argsort, tells the order.
+    Args:
+        first: world to begin with.
+        last: world to end before.
+        away: from drones to points, m.
+        apart: between drones, infinite to oneself, m.
+        radius: sensing radius, m.
+        health: of the drones.
+        position: of the drones, m.
+        point: m.
+        revealed: points that are known to kill.
+        out: written into: relative positions; whether revealed; distance to the nearest other live drone
+            that is sensed, at most the radius, m.
+        column: where that begins.
     """
-    agents, things, worlds = distance.shape
-    low = (1 << (things - 1).bit_length()) - 1
-    row = np.empty((worlds, agents, things))
-    # one agent at a time: turned all at once, numbers a power of two apart evict each other from the cache
-    for i in range(agents):
-        row[:, i] = distance[i].T
-    key = row.view(np.int64)
-    key &= ~low
-    key |= np.arange(things) if first is None else np.arange(things) + (first * _FRONT).T[:, None]
-    key.sort(axis=-1)
-    return np.ascontiguousarray((key[..., :slots].astype(np.int8) & low).T)
+    agents, points, _ = away.shape
+    order, distance, taken = np.empty(points, np.int64), np.empty(points), np.empty(points)
+    for world in range(first, last):
+        for i in range(agents):
+            rank_within(away[i, :, world], np.inf, order, distance)
+            taken[:] = radius
+            for j in range(agents):
+                if apart[i, j, world] <= radius and health[world, j] > 0:
+                    for k in range(points):
+                        taken[k] = min(taken[k], away[j, k, world])
+            row = out[world, i]
+            for k in range(points):
+                which = order[k]
+                for axis in range(3):
+                    row[column + 3 * k + axis] = point[axis, which, world] - position[axis, i, world]
+                row[column + 3 * points + k] = revealed[which, world]
+                row[column + 4 * points + k] = taken[which]
 
 
-def _count(near: Bool[np.ndarray, "N M B"]) -> Int8[np.ndarray, "N B"]:
-    """How many things are near each agent."""
-    return np.add.reduce(near, axis=1, dtype=np.int8)
+@compiled
+def write_routes(
+    first: int,
+    last: int,
+    terminal: Float[np.ndarray, "3 2 B"],
+    hops: Int8[np.ndarray, "2 N+2 B"],
+    position: Float[np.ndarray, "3 N B"],
+    out: Float32[np.ndarray, "B N O"],
+    column: int,
+) -> None:
+    """Write where both terminals are, relative to each drone, then whether messages get there."""
+    for world in range(first, last):
+        for i in range(position.shape[1]):
+            for k in range(2):
+                for axis in range(3):
+                    gap = terminal[axis, k, world] - position[axis, i, world]
+                    out[world, i, column + 3 * k + axis] = gap
+                out[world, i, column + 6 + k] = hops[k, 2 + i, world] >= 0
 
 
-def _fill(which: Int8[np.ndarray, "K N B"], count: Int8[np.ndarray, "N B"]) -> Sensed:
-    """Fill the first ``count`` slots of each agent, and the others with itself."""
-    slots, agents, worlds = which.shape
-    seen = np.arange(slots, dtype=np.int8)[:, None, None] < count
-    return Sensed(_place(np.where(seen, which, np.arange(agents, dtype=np.int8)[:, None]), worlds), seen)
-
-
-def _place(which: Int8[np.ndarray, "K N B"], worlds: int) -> Int[np.ndarray, "K N B"]:
-    """Where the things stand in a flat table."""
-    place = np.multiply(which, worlds, dtype=np.int64)
-    place += np.arange(worlds)
-    return place
+@compiled
+def rank_within(
+    away: Float[np.ndarray, "M"],
+    radius: float,
+    order: Int[np.ndarray, "M"],
+    distance: Float[np.ndarray, "M"],
+) -> int:
+    """Write which things lie within a radius, nearest first, and how far away; return how many."""
+    count = 0
+    for k in range(len(away)):
+        if away[k] <= radius:
+            place = count
+            while place > 0 and away[k] < distance[place - 1]:
+                order[place], distance[place] = order[place - 1], distance[place - 1]
+                place -= 1
+            order[place], distance[place] = k, away[k]
+            count += 1
+    return count
