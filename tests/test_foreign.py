@@ -9,11 +9,12 @@ import pytest
 from foreign import SEEN, TASK, WORKING, A, N, acting, policy, step
 
 from hipg_bench import registry
-from hipg_bench.errors import AgentFailure, SandboxError
+from hipg_bench.errors import AgentFailure, HostFailure, SandboxError
 from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.policies.foreign import agent_seeds
 from hipg_bench.policies.policy import Policy
 from hipg_bench.sandbox import choice
+from hipg_bench.sandbox.backend import Start
 from hipg_bench.sandbox.budget import Budget
 
 pytestmark = pytest.mark.skipif(not WORKING, reason="no sandbox works on this machine")
@@ -60,6 +61,8 @@ def test_episodes_are_the_same_in_the_sandbox_in_a_plain_child_and_in_this_proce
         assert isinstance(agent, Policy)
         assert agent.sandbox == ("none" if trust else WORKING[0])
         assert plan.play_all(short, agent) == here
+    one_by_one = Plan(episodes=3, num_envs=1, threads=1)
+    assert one_by_one.play_all(short, policy(tmp_path, LINEAR, spec=short)) == here
 
 
 def test_the_agent_is_told_the_task_and_its_training_seed_and_nothing_of_the_worlds(tmp_path, monkeypatch):
@@ -221,6 +224,26 @@ def test_memory_beyond_the_limit_is_refused(tmp_path):
         step(policy(tmp_path, hog))
     small = acting(f"np.ones(1 << 26, np.uint8)\n{ZEROS}")
     step(policy(tmp_path, small))
+
+
+def test_a_sandbox_that_fails_to_start_is_tried_once_more_and_costs_the_agent_nothing(tmp_path, monkeypatch):
+    good = choice.BACKENDS[WORKING[0]]
+    starts = []
+
+    def bad_at_first(folder):
+        starts.append(folder)
+        return Start(["/no/such/program"], {}) if len(starts) <= bad else good(folder)
+
+    agent = policy(tmp_path, LINEAR)
+    monkeypatch.setattr(choice, "BACKENDS", {agent.sandbox: bad_at_first})
+    bad = 1
+    step(agent)
+    assert len(starts) == 3  # a failure, the child that plays, the one that waits
+    bad = 100
+    starts.clear()
+    with pytest.raises(HostFailure, match="/no/such/program"):
+        step(policy(tmp_path, LINEAR))
+    assert len(starts) == 2
 
 
 def test_without_a_sandbox_code_of_others_is_refused(tmp_path, monkeypatch):

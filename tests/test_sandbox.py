@@ -13,6 +13,7 @@ import pytest
 from foreign import WORKING, descendants
 
 from hipg_bench.errors import AgentFailure, HostFailure, SandboxError
+from hipg_bench.evaluation import doctor
 from hipg_bench.sandbox import bubblewrap, choice, landlock, probe
 from hipg_bench.sandbox.backend import Start, open_door
 from hipg_bench.sandbox.budget import Budget
@@ -221,3 +222,17 @@ def _alive(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def test_the_doctor_says_how_each_sandbox_did(monkeypatch):
+    fine, broken = probe.Trial(seconds=0.3), probe.Trial(trouble="bwrap is not installed")
+    monkeypatch.setattr(choice, "trials", lambda: {"bubblewrap": broken, "landlock": fine})
+    found = {finding.name: finding for finding in doctor._sandbox()}
+    assert [finding.level for finding in found.values()] == ["note", "ok"]
+    assert found["sandbox bubblewrap"].mend == "apt install bubblewrap"
+    assert "refuses read a file" in found["sandbox landlock"].text
+    leaky = probe.Trial(("TCP",))
+    monkeypatch.setattr(choice, "trials", lambda: {"bubblewrap": broken, "landlock": leaky})
+    findings = list(doctor._sandbox())
+    assert [finding.level for finding in findings] == ["warning", "warning"]  # built-in agents can be scored
+    assert "lets through TCP" in findings[1].text

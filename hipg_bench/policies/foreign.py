@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench import registry
-from hipg_bench.errors import AgentFailure
+from hipg_bench.errors import AgentFailure, HostFailure
 from hipg_bench.layout import Layout
 from hipg_bench.sandbox import choice
 from hipg_bench.sandbox.budget import PROTOCOL, Budget
@@ -108,13 +108,13 @@ class ForeignPolicy:
 
         Raises:
             AgentFailure: it does not get that far in time.
-            HostFailure: the child could not be started.
+            HostFailure: the child could not be started, twice.
         """
-        child = self._next or self._child()
-        self._playing.add(child)
-        self._next = None
         seeds = agent_seeds(seed, episode_id).tobytes()
-        child.ask({"do": "reset"}, [seeds], self._budget.start_up)
+        try:
+            child = self._begin(seeds)
+        except HostFailure:  # not the agent's fault: once more
+            child = self._begin(seeds)
         self._next = self._child()  # Python starts while this one plays
         return Session(child, self._budget.bank)
 
@@ -122,6 +122,13 @@ class ForeignPolicy:
         """End the children that play."""
         for child in self._playing:
             child.kill()
+
+    def _begin(self, seeds: bytes) -> Child:
+        child = self._next or self._child()
+        self._next = None
+        self._playing.add(child)
+        child.ask({"do": "reset"}, [seeds], self._budget.start_up)
+        return child
 
     def _child(self) -> Child:
         return Child(choice.BACKENDS[self.sandbox], self._folder, self._setup, self._budget)

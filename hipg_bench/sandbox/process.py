@@ -65,7 +65,7 @@ class Child:
             )  # fmt: skip
         except OSError as error:
             raise HostFailure(f"a child process could not be started: {error}") from error
-        self._finalize = weakref.finalize(self, _end, self._process)
+        self._finalize = weakref.finalize(self, _end, self._process, os.getpid())
         self._in, self._out, self._err = (
             stream.fileno()
             for stream in (self._process.stdin, self._process.stdout, self._process.stderr)
@@ -227,8 +227,10 @@ class Child:
         return f"{text}; it printed:\n{said}" if said else text
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and its group, and close its pipes."""
+def _end(process: subprocess.Popen[bytes], owner: int) -> None:
+    """Kill a process and its group, and close its pipes; a fork of the owner leaves it alone."""
+    if os.getpid() != owner:
+        return
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.kill()
