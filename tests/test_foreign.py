@@ -234,7 +234,7 @@ def test_a_sandbox_that_fails_to_start_is_tried_once_more_and_costs_the_agent_no
         starts.append(folder)
         return Start(["/no/such/program"], {}) if len(starts) <= bad else good(folder)
 
-    agent = policy(tmp_path, LINEAR)
+    agent, other = policy(tmp_path, LINEAR), policy(tmp_path, LINEAR)
     monkeypatch.setattr(choice, "BACKENDS", {agent.sandbox: bad_at_first})
     bad = 1
     step(agent)
@@ -242,7 +242,7 @@ def test_a_sandbox_that_fails_to_start_is_tried_once_more_and_costs_the_agent_no
     bad = 100
     starts.clear()
     with pytest.raises(HostFailure, match="/no/such/program"):
-        step(policy(tmp_path, LINEAR))
+        step(other)
     assert len(starts) == 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import time
@@ -115,7 +116,8 @@ class ForeignPolicy:
             child = self._begin(seeds)
         except HostFailure:  # not the agent's fault: once more
             child = self._begin(seeds)
-        self._next = self._child()  # Python starts while this one plays
+        with contextlib.suppress(HostFailure):
+            self._next = self._child()  # Python starts while this one plays
         return Session(child, self._budget.bank)
 
     def close(self) -> None:
