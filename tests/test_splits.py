@@ -13,6 +13,7 @@ from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.scripted import Scripted
 from hipg_bench.policies.simple import Random, Zero
+from hipg_bench.registry import tagged
 
 NAV = task_spec("hazard_nav-4")
 SHIFTED = splits.SPLITS[1:]
@@ -179,6 +180,19 @@ def test_films_show_the_shifted_task(tmp_path):
     (film,) = films.choose(agent, short, rows[64:], plan, 1, tmp_path)
     assert film.spec.params["thrust"] == 8.0
     assert json.loads(str(np.load(film.saved)["spec"]))["params"]["thrust"] == 8.0
+
+
+@pytest.mark.parametrize("split", SHIFTED)
+@pytest.mark.parametrize("task", tagged("standard"))
+def test_every_standard_task_has_anchors_in_every_split(task, split):
+    anchors = splits.with_anchors(split, task_spec(task)).anchors
+    assert anchors is not None
+    assert anchors.random.episodes >= 1000
+    assert anchors.reference.episodes >= 1000 or "stated" in anchors.reference_is
+    # a gap of at least five standard errors of either end
+    low, high = anchors.random, anchors.reference
+    error = max((end[1] - end[0]) / 3.92 for end in (low.ci95, high.ci95))
+    assert high.mean - low.mean > 5 * error
 
 
 def test_anchors_are_only_for_the_task_as_it_is():

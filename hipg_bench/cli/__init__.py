@@ -22,6 +22,7 @@ from hipg_bench.cli import (
     leaderboard,
     media,
     submit,
+    suite,
     tasks,
     train,
 )
@@ -43,6 +44,7 @@ app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
 app.add_typer(submit.app, name="submit")
 app.add_typer(leaderboard.app, name="leaderboard")
+app.add_typer(suite.app, name="suite")
 app.command()(calibrate.calibrate)
 app.command()(audit.audit)
 app.command()(bench.bench)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from hipg_bench.evaluation import statistics
 from hipg_bench.evaluation.episodes import Row
 from hipg_bench.evaluation.failures import NOT_PLAYED, OK, failures_of_a_dnf
-from hipg_bench.evaluation.statistics import Runs, iqm_ci95, mean_ci95
+from hipg_bench.evaluation.statistics import Runs, mean_ci95
 from hipg_bench.spec import TaskSpec
 
 SCHEMA = 2
@@ -55,15 +56,55 @@ def summarise(spec: TaskSpec, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def aggregate(played: Sequence[tuple[TaskSpec, Sequence[Row]]]) -> dict[str, Any]:
-    """Interquartile mean of the score over tasks that have anchors; unplayed ones count as 0, as random."""
+    """The whole suite in a few numbers; tasks without anchors are left out, unplayed ones count as 0.
+
+    Scores of runs are cut to `statistics.CLIP`. With at least `METHOD_RUNS` training seeds for every task
+    played, intervals are over training seeds; with fewer there is one for the interquartile mean only, over
+    episodes.
+    """
     scored = [(spec, rows) for spec, rows in played if spec.anchors is not None]
-    missing = sum(not rows for _, rows in scored)
-    if not scored:
-        return {"score_iqm": None, "score_iqm_ci95": None, "tasks": 0, "counted_as_zero": 0}
-    iqm, interval = iqm_ci95([_scores(spec, rows) for spec, rows in scored])
-    return {
-        "score_iqm": iqm, "score_iqm_ci95": list(interval), "tasks": len(scored), "counted_as_zero": missing,
+    names = [spec.task for spec, _ in scored]
+    runs = {spec.task: len(_by_seed(rows)) for spec, rows in scored if rows}
+    whole: dict[str, Any] = {
+        "tasks": len(scored), "scored": names, "counted_as_zero": len(scored) - len(runs), "runs": runs,
+        "score_iqm": None, "score_iqm_ci95": None,
     }  # fmt: skip
+    if not scored:
+        return whole
+    episodes = [_scores(spec, rows) for spec, rows in scored]
+    scores = [np.clip([run.mean() for run in task], *statistics.CLIP) for task in episodes]
+    method = bool(runs) and min(runs.values()) >= statistics.METHOD_RUNS
+    for name, statistic in _STATISTICS.items():
+        whole[name] = float(statistic(scores))
+        whole[f"{name}_ci95"] = [float(end) for end in statistics.ci95(statistic, scores)] if method else None
+    if not method:
+        whole["score_iqm_ci95"] = list(statistics.iqm_ci95(episodes)[1])
+    whole["profile"] = _profile(scores, method)
+    return whole
+
+
+_STATISTICS = {
+    "score_iqm": statistics.iqm,
+    "score_mean": statistics.mean,
+    "score_median": statistics.median,
+    "optimality_gap": statistics.optimality_gap,
+}
+"""Numbers of a suite by their name in ``results.json``."""
+_THRESHOLDS = np.linspace(*statistics.CLIP, 41)
+"""Scores at which a performance profile is told."""
+
+
+def _profile(scores: statistics.Scores, method: bool) -> dict[str, Any]:
+    """Share of (run, task) scores above each threshold, with its band for methods."""
+
+    def share(drawn: statistics.Drawn) -> np.ndarray:
+        return statistics.profile(drawn, _THRESHOLDS)
+
+    return {
+        "thresholds": np.round(_THRESHOLDS, 6).tolist(),
+        "share": share(scores).tolist(),
+        "ci95": [end.tolist() for end in statistics.ci95(share, scores, reps=2000)] if method else None,
+    }
 
 
 def _scores(spec: TaskSpec, rows: Sequence[Row]) -> Runs:

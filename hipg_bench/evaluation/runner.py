@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from hipg_bench.errors import BundleError, ResumeError, UnknownNameError
-from hipg_bench.evaluation import films, report, splits
+from hipg_bench.evaluation import films, protocol, report, splits
 from hipg_bench.evaluation.episodes import Plan, Row, versions
 from hipg_bench.evaluation.failures import NOT_PLAYED, close
 from hipg_bench.evaluation.latency import Stopwatch
+from hipg_bench.evaluation.ranking import kind_of
 from hipg_bench.evaluation.results import SCHEMA, aggregate, summarise
 from hipg_bench.evaluation.seeds import commitment
 from hipg_bench.paths import write_text
@@ -117,7 +118,9 @@ def evaluate(
         "schema": SCHEMA,
         "suite": suite.name,
         "split": plan.split,
+        "protocol": protocol.identity(),
         "agent": agent.name,
+        "kind": kind_of(agent.card.kind == "builtin", [len(found) for found in seeds.values()]),
         "agent_summary": agent.summary,
         "seed": None,
         "commitment": None,
