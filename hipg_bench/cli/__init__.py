@@ -18,6 +18,7 @@ from hipg_bench.cli import (
     collect,
     doctor,
     evaluate,
+    export,
     figures,
     leaderboard,
     media,
@@ -35,6 +36,7 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
 )
 app.command()(evaluate.evaluate)
+app.command()(export.export)
 app.command()(train.train)
 app.command()(collect.collect)
 app.command()(figures.figures)

@@ -1,0 +1,24 @@
+"""``hipg-bench export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hipg_bench.cli import console
+
+
+def export(
+    folders: Annotated[list[Path], typer.Argument(help="What `evaluate` wrote: an agent and a split each.")],
+    out: Annotated[Path, typer.Option(help="File to write.")] = Path("marl_eval.json"),
+) -> None:
+    """Write evaluations of several agents as the JSON that marl-eval reads."""
+    import json
+
+    from hipg_bench.evaluation.export import marl_eval
+    from hipg_bench.paths import write_text
+
+    write_text(out, json.dumps(marl_eval(folders), allow_nan=False) + "\n")
+    console.out.print(str(out), markup=False, soft_wrap=True)
