@@ -1,64 +1,125 @@
-"""marl-eval's JSON, as its own loader reads it."""
-
-import json
+"""What libraries' networks do is what their policy files do."""
 
 import numpy as np
 import pytest
+import torch
+from stable_baselines3 import A2C, PPO, SAC, TD3
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
-from hipg_bench import task_spec
-from hipg_bench.errors import HipgError
-from hipg_bench.evaluation import runner
-from hipg_bench.evaluation.episodes import Plan
-from hipg_bench.evaluation.export import marl_eval
-from hipg_bench.policies.bundle import load_agent
+from hipg_bench.adapters.sb3 import HipgVecEnv
+from hipg_bench.errors import BundleError
+from hipg_bench.policies.export import export_recurrent, export_sb3, export_sequential
+from hipg_bench.policies.network import load_network
 
-TASKS = ("hazard_nav-4", "coop_nav-3")
-
-
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs")
-    suite = runner.Suite("custom", tuple(task_spec(task) for task in TASKS))
-    for name, split in (("random", "standard"), ("zero", "standard"), ("zero", "forced_death")):
-        plan = Plan(episodes=3, threads=1, split=split)
-        runner.evaluate(load_agent(name), suite, out / f"{name}-{split}", plan)
-    return out
+ALIVE = np.ones((5, 4), bool)
 
 
-def test_every_level_is_what_marl_eval_expects(folders):
-    """The walk of `marl_eval.utils.data_processing_utils.data_process_pipeline`, 0.0.4."""
-    document = json.loads(json.dumps(marl_eval(sorted(folders.iterdir())), allow_nan=False))
-    assert set(document) == {"hipg_bench", "hipg_bench_forced_death"}
-    assert set(document["hipg_bench"]) == set(TASKS)
-    for tasks in document.values():
-        for algorithms in tasks.values():
-            for algorithm, runs in algorithms.items():
-                assert "," not in algorithm
-                for steps in runs.values():
-                    assert list(steps) == ["step_0", "absolute_metrics"]
-                    assert "step_count" in steps["step_0"]
-                    for metrics in steps.values():
-                        for name, values in metrics.items():
-                            if name != "step_count":
-                                assert len(values) == 3
-                                assert np.isfinite(np.mean(values))
+def acted(path, observation):
+    policy = load_network(path)
+    return policy.act(observation, policy.initial_state(0, np.arange(5), 4), ALIVE)[0]
 
 
-def test_the_numbers_are_those_of_the_rows(folders):
-    document = marl_eval([folders / "random-standard"])
-    lines = (folders / "random-standard/episodes/hazard_nav-4.jsonl").read_text().splitlines()
-    rows = [json.loads(line) for line in lines]
-    run = document["hipg_bench"]["hazard_nav-4"]["random"]["seed_0"]
-    for name in ("return", "score", "survival", "deaths"):
-        assert run["absolute_metrics"][name] == [row[name] for row in rows]
-        assert run["step_0"][name] == run["absolute_metrics"][name]
+@pytest.mark.parametrize(("method", "spread"), [(PPO, 1.0), (A2C, 0.0), (SAC, 1.0), (TD3, 0.0)])
+def test_sb3_acts_as_its_file(tmp_path, method, spread):
+    """Untrained, since any weights will do; with statistics of a few steps where ``spread`` asks for them."""
+    worlds = HipgVecEnv("hazard_nav-4", num_envs=5)
+    if spread:
+        worlds = VecNormalize(worlds)
+    model = method("MlpPolicy", worlds, seed=0, policy_kwargs={"net_arch": [16, 16]})
+    observation = worlds.reset()
+    for _ in range(5 * int(spread)):
+        observation, *_ = worlds.step(model.predict(observation)[0])
+    with torch.no_grad():
+        for name, tensor in model.policy.named_parameters():
+            if "action_net" in name or ".mu" in name:
+                tensor.mul_(5.0)  # actions that reach the borders
+    expected = model.predict(observation, deterministic=True)[0].reshape(5, 4, 3)
+    raw = worlds.get_original_obs() if spread else observation
+    export_sb3(model, tmp_path / "seed0.safetensors")
+    actual = acted(tmp_path / "seed0.safetensors", raw.reshape(5, 4, -1))
+    assert expected.std() > 0.01
+    np.testing.assert_allclose(actual, expected, atol=1e-4)
 
 
-def test_bad_folders_are_refused(folders, tmp_path):
-    with pytest.raises(HipgError, match="not a finished evaluation"):
-        marl_eval([tmp_path])
-    with pytest.raises(HipgError, match="zero on hazard_nav-4, standard, is there already"):
-        marl_eval([folders / "zero-standard"] * 2)
-    (tmp_path / "results.json").write_text('{"schema": 1}')
-    with pytest.raises(HipgError, match="schema 2 is allowed, got 1"):
-        marl_eval([tmp_path])
+def test_sb3_with_another_clip_is_refused(tmp_path):
+    worlds = VecNormalize(HipgVecEnv("hazard_nav-4"), clip_obs=5.0)
+    with pytest.raises(BundleError, match=r"VecNormalize\(clip_obs=10\) is allowed, got 5"):
+        export_sb3(PPO("MlpPolicy", worlds), tmp_path / "x")
+
+
+class Statistics:
+    mean, var = np.linspace(-1, 1, 6), np.linspace(0.5, 3, 6)
+
+
+SEEN = np.random.default_rng(0).normal(0, 2, (5, 4, 6)).astype(np.float32)
+
+
+@pytest.mark.parametrize("squash", [[], [nn.Tanh()]], ids=["cut", "squashed"])
+@pytest.mark.parametrize("normaliser", [None, Statistics()], ids=["raw", "normalised"])
+def test_a_sequence_acts_as_its_file(tmp_path, squash, normaliser):
+    torch.manual_seed(0)
+    actor = nn.Sequential(nn.Flatten(-1), nn.Linear(6, 8), nn.ReLU(), nn.Linear(8, 3, bias=False), *squash)
+    export_sequential(actor, tmp_path / "x", normaliser, epsilon=0.0)
+    seen = SEEN if normaliser is None else (SEEN - Statistics.mean) / np.sqrt(Statistics.var)
+    with torch.no_grad():
+        expected = actor[1:](torch.tensor(seen, dtype=torch.float32)).clamp(-1, 1).numpy()
+    np.testing.assert_allclose(acted(tmp_path / "x", SEEN), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "encoder", [None, nn.Sequential(nn.Linear(6, 7), nn.ReLU())], ids=["bare", "encoded"]
+)
+def test_a_recurrent_network_acts_as_its_file(tmp_path, encoder):
+    unit, actor = nn.GRUCell(6 if encoder is None else 7, 5), nn.Sequential(nn.Linear(5, 3), nn.Tanh())
+    export_recurrent(encoder, unit, actor, tmp_path / "x")
+    policy = load_network(tmp_path / "x")
+    memory, hidden = policy.initial_state(0, np.arange(5), 4), torch.zeros(20, 5)
+    for _ in range(3):
+        action, memory = policy.act(SEEN, memory, ALIVE)
+        with torch.no_grad():
+            seen = torch.tensor(SEEN.reshape(20, 6))
+            hidden = unit(seen if encoder is None else encoder(seen), hidden)
+            np.testing.assert_allclose(action, actor(hidden).reshape(5, 4, 3).numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "actor",
+    [
+        nn.Sequential(nn.Linear(6, 8), nn.GELU(), nn.Linear(8, 3)),
+        nn.Sequential(nn.Linear(6, 8), nn.Tanh(), nn.Linear(8, 8), nn.ReLU(), nn.Linear(8, 3)),
+        nn.Sequential(nn.Linear(6, 8), nn.ReLU()),
+        nn.Sequential(nn.LayerNorm(6), nn.Linear(6, 3)),
+        nn.Sequential(nn.Linear(6, 8), nn.Linear(8, 3)),
+    ],
+)
+def test_other_networks_are_refused(tmp_path, actor):
+    with pytest.raises(
+        BundleError, match=r"Linear layers with Tanh or with ReLU .*export other networks as ONNX"
+    ):
+        export_sequential(actor, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_an_activation_may_be_used_twice(tmp_path):
+    tanh = nn.Tanh()
+    actor = nn.Sequential(nn.Sequential(nn.Linear(6, 8), tanh), nn.Linear(8, 8), tanh, nn.Linear(8, 3))
+    export_sequential(actor, tmp_path / "x")
+    with torch.no_grad():
+        expected = actor(torch.tensor(SEEN)).clamp(-1, 1).numpy()
+    np.testing.assert_allclose(acted(tmp_path / "x", SEEN), expected, atol=1e-4)
+
+
+def test_other_recurrent_networks_are_refused(tmp_path):
+    actor = nn.Sequential(nn.Linear(5, 4), nn.Tanh(), nn.Linear(4, 3))
+    with pytest.raises(BundleError, match="one layer in one direction"):
+        export_recurrent(None, nn.GRU(6, 5, num_layers=2), actor, tmp_path / "x")
+    with pytest.raises(BundleError, match="one activation is allowed, got relu and tanh"):
+        export_recurrent(nn.Sequential(nn.Linear(6, 6), nn.ReLU()), nn.GRU(6, 5), actor, tmp_path / "x")
+    with pytest.raises(BundleError, match="Linear layers with Tanh or with ReLU"):
+        export_recurrent(nn.Sequential(nn.Linear(6, 6)), nn.GRU(6, 5), actor, tmp_path / "x")
+
+
+def test_statistics_of_another_size_are_refused(tmp_path):
+    with pytest.raises(BundleError, match=r"the normaliser is of \(6,\), the network takes in \(7,\)"):
+        export_sequential(nn.Sequential(nn.Linear(7, 3)), tmp_path / "x", Statistics())
