@@ -225,6 +225,10 @@ def test_curves_come_from_trials_and_else_from_training(agents: Path) -> None:
     np.testing.assert_allclose(old.score, 0.5)
     assert old.final == pytest.approx(0.5), "without a measured score, the curve's end"
     assert all(one.tried for one in found if one.arm != "local")
+    # returns of a training that paid otherwise than the task are no scores
+    record = agents / "mappo_local" / "hazard_nav-4" / "seed7.json"
+    record.write_text(json.dumps({"settings": {"weights": {"alive": 0.1}}}))
+    assert "local" not in {one.arm for one in traces(agents)}
 
 
 def test_figures_and_page(agents: Path, tmp_path: Path) -> None:

@@ -39,6 +39,8 @@ _GROWING: dict[str, tuple[tuple[str, str], ...]] = {
     "standard": (("hazard_nav-4", "hazard_nav-8"), ("hazard_comm-10", "hazard_comm-16")),
 }
 _HARMLESS: dict[str, tuple[str, ...]] = {"paper": ("paper_coop_nav-3",), "standard": ("coop_nav-3",)}
+TASKS = tuple(task for suite in SUITES for task in (*SUITES[suite], *_HARMLESS[suite]))
+"""All tasks of the comparison."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +86,7 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
         ("min-health's lead over central grows with the team", _growth(runs, _GROWING[suite])),
         ("min-health's runs differ less than central's", arms("central", "min_health", spreads, hazard)),
         (
-            "local learns first: it is above central in the first fifth",
+            "local learns first: above central in the first fifth",
             arms("local", "central", early, hazard),
         ),
         ("local plateaus: central gains more after half-time", arms("central", "local", late_gains, hazard)),

@@ -147,9 +147,8 @@ def _panel(axes: Axes, task: str, runs: Sequence[Trace], arms: Sequence[str], ba
         )  # fmt: skip
         counts.append(len(own))
     few, many = min(counts), max(counts)
-    axes.set_title(
-        f"{few} to {many} runs" if few < many else f"{many} runs each", fontsize=9, loc="right", color=_PALE
-    )
+    told = f"{few} to {many} runs" if few < many else f"{many} run{'s' if many > 1 else ''} each"
+    axes.set_title(told, fontsize=9, loc="right", color=_PALE)
     axes.set_xlim(left=0)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from hipg_bench.comparison.artefacts import BUNDLES
-from hipg_bench.comparison.claims import Judged
+from hipg_bench.comparison.claims import TASKS, Judged
 from hipg_bench.comparison.figures import FAMILIES
 from hipg_bench.comparison.traces import Trace
 from hipg_bench.errors import HipgError
@@ -63,7 +63,7 @@ def verdict_table(judged: Sequence[Judged]) -> str:
 def score_table(runs: Sequence[Trace]) -> str:
     """Interquartile mean, worst and best of what the runs of every arm reached."""
     lines = ["| task | " + " | ".join(BUNDLES) + " |", "|---" * (1 + len(BUNDLES)) + "|"]
-    for task in dict.fromkeys(task for tasks in FAMILIES.values() for task in tasks):
+    for task in TASKS:
         cells = [_cell([run.final for run in runs if (run.task, run.arm) == (task, arm)]) for arm in BUNDLES]
         lines.append(f"| {task} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -32,8 +32,7 @@ class Trace:
         seed: of the training.
         steps: (K,) environment steps, rising.
         score: (K,) there, 0 as random actions and 1 as the reference.
-        tried: scores are of trials without exploration; else of the training's own episodes, with
-            exploration and the weights of training.
+        tried: scores are of trials without exploration; else of the training's own episodes.
         final: what the last policy reached by the standard protocol; else the mean of the last tenth.
     """
 
@@ -83,19 +82,18 @@ def _arm(bundle: str) -> str | None:
 
 
 def _read(path: Path, arm: str, spec: TaskSpec, seed: int) -> Iterator[Trace]:
-    """The run of a curve, if anything was measured."""
+    """The run of a curve, if anything was measured that can be compared."""
+    record = json.loads(path.with_name(f"seed{seed}.json").read_text(encoding="utf-8"))
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     scores = [(float(row["steps"]), float(row["score"])) for row in rows if row.get("score")]
     tried = len(scores) > 1
-    if not tried:
-        scores = [
-            (float(row["steps"]), spec.score(float(row["return"]))) for row in rows if row.get("return")
-        ]
+    if not tried and not record.get("settings", {}).get("weights"):  # else it was paid for other things
+        returns = [(float(row["steps"]), float(row["return"])) for row in rows if row.get("return")]
+        scores = [(steps, spec.score(value)) for steps, value in returns]
     if not scores:
         return
     steps, score = np.array(scores).T
-    record = json.loads(path.with_name(f"seed{seed}.json").read_text(encoding="utf-8"))
     final = record.get("result", {}).get("score")
     last = score[steps > (1 - _END) * steps[-1]].mean()
     yield Trace(arm, spec.task, seed, steps, score, tried, float(last if final is None else final))
