@@ -1,4 +1,4 @@
-"""docs/submit.md, command by command: from a training to a verified entry, as a newcomer and a maintainer do it."""
+"""docs/submit.md, command by command: a newcomer trains and packs, a maintainer adds and verifies."""
 
 import os
 import re
@@ -33,8 +33,9 @@ def desk(tmp_path_factory):
     said = []
     for block in COMMANDS:
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", block], cwd=folder, capture_output=True, text=True, check=False,
-            env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}, timeout=600,
+            ["bash", "-euo", "pipefail", "-c", block], cwd=folder, timeout=600,
+            capture_output=True, text=True, check=False,
+            env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
         )  # fmt: skip
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
         said.append(done.stdout)
