@@ -7,6 +7,8 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from safetensors.numpy import save_file
 from torch import nn
 
@@ -368,6 +370,7 @@ def test_a_form_says_which_blocks_there_are():
     ("changed", "reason"),
     [
         ({"gru.weight_hh": (18, 5)}, "gru.weight_ih is (18, 8); expected (15, 8)"),
+        ({"gru.weight_hh": (18,)}, "gru.weight_hh is (18,); expected (3 H, H)"),
         ({"gru.weight_hh": (0,)}, "gru.weight_hh is (0,); expected (3 H, H)"),
         ({"gru.weight_ih": (18, 5)}, "gru.weight_ih is (18, 5); expected (18, 8)"),
         ({"gru.bias_ih": (6,)}, "gru.bias_ih is (6,); expected (18,)"),
@@ -476,6 +479,38 @@ def hostile_files(folder):
         "lying": "", "short": "", "header": "", "garbage": "", "empty": "",
         "bulky": "at most 81000000 bytes are allowed, got 2147483648",
     }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sound_files(gru_file, attention_file):
+    return [gru_file[0], attention_file[0]]
+
+
+@given(data=st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_damaged_file_is_refused_or_a_sound_network(sound_files, tmp_path, data):
+    """Bytes changed, cut or put in anywhere, most of them in the header."""
+    content = bytearray(data.draw(st.sampled_from(sound_files)).read_bytes())
+    header = int.from_bytes(content[:8], "little")
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, min(header + 20, len(content) - 1)))
+        match data.draw(st.sampled_from(["set", "cut", "put"])):
+            case "set":
+                content[at] = data.draw(st.sampled_from(b'0123456789[]{},:" FNI\xff\x00'))
+            case "cut":
+                del content[at : at + data.draw(st.integers(1, 8))]
+            case "put":
+                content[at:at] = data.draw(
+                    st.sampled_from([b"9", b"null", b"[", b"NaN", b'"x":', b"1e999", b"-"])
+                )
+    (tmp_path / "one").write_bytes(content)
+    try:
+        policy = load_network(tmp_path / "one")
+    except BundleError:
+        return
+    seen = np.full((2, 3, policy.observation_size), 1e30, np.float32)
+    action, _ = policy.act(seen, policy.initial_state(0, np.arange(2), 3), np.ones((2, 3), bool))
+    assert np.isfinite(action).all()
 
 
 def test_hostile_files_are_refused(tmp_path):

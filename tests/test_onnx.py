@@ -1,10 +1,13 @@
 """ONNX agents act as the graph does, one agent at a time in a sandbox; those that can do more are refused."""
 
+import contextlib
 import warnings
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from torch import nn
 
 from hipg_bench import make, task_spec
@@ -187,6 +190,18 @@ def test_a_graph_with_sparse_weights_is_refused(tmp_path):
     model.graph.sparse_initializer.add()
     with pytest.raises(BundleError, match="sparse weights are not allowed"):
         bundle(tmp_path, model).policy(SPEC)
+
+
+@given(data=st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_damaged_graph_is_refused_or_looks_sound(recurrent, tmp_path, data):
+    """Of bytes changed anywhere come reasons only; what looks sound meets the checker in the sandbox."""
+    content = bytearray((recurrent[0].folder / SPEC.task / "seed0.onnx").read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    (tmp_path / "one.onnx").write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
+    with contextlib.suppress(BundleError):
+        check_graph(tmp_path / "one.onnx", SIZE, 3)
 
 
 def test_a_large_file_is_refused_before_it_is_read(tmp_path):

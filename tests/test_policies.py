@@ -124,6 +124,10 @@ def bundle(folder, text):
             "tasks.t = [1, 1]: one or more different seeds",
         ),
         ('name = "x"\nsummary = "s"\nbuiltin = "zero"\nlink = "javascript:x"', "link = 'javascript:x'"),
+        (
+            'name = "x"\nsummary = "s"\nbuiltin = "zero"\n[training]\nhour = 2',
+            "[training]: no field 'hour'; did you mean 'hours'?",
+        ),
         ("#" * 70_000, "at most 65536 bytes"),
         ('name = "../x"\nsummary = "s"\nbuiltin = "zero"', "name = '../x' is refused"),
         ('name = "x"\nsumary = "s"\nbuiltin = "zero"', "sum"),

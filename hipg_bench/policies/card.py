@@ -90,6 +90,8 @@ def read_card(path: Path) -> Card:
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BundleError(f"{path}: {error}") from error
     try:
+        if isinstance(values.get("training"), dict):  # by itself: its fields' nearest names are its own
+            parse(Training, values["training"], f"{path}: [training]")
         card = parse(Card, values, str(path))
     except SpecError as error:
         raise BundleError(str(error)) from error

@@ -61,9 +61,10 @@ class GRU:
             BundleError: shapes that do not chain from the observation to the action.
         """
         width = check_stack(shapes, "encoder", check_observation(shapes))
-        hidden = (*shapes.get("gru.weight_hh", ()), 0)[-2]
+        back = shapes.get("gru.weight_hh", ())
+        hidden = back[-1] if len(back) == 2 else 0
         if not 0 < hidden <= WIDEST:
-            raise BundleError(f"gru.weight_hh is {shapes.get('gru.weight_hh')}; expected (3 H, H)")
+            raise BundleError(f"gru.weight_hh is {back}; expected (3 H, H)")
         unit = {
             "gru.weight_ih": (3 * hidden, width),
             "gru.weight_hh": (3 * hidden, hidden),
