@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from hipg_bench.errors import RenderError
+from hipg_bench.rendering.camera import Camera, focal_length
 
 Point = np.ndarray | tuple[float, float, float]
 """A place, m."""
@@ -18,7 +19,9 @@ Colour = np.ndarray | tuple[float, ...]
 _UPRIGHT = np.eye(3).ravel()
 _NOWHERE = np.zeros(3)
 _THIN = 0.0075
-"""Rods up to this radius, m, are drawn with four sides: round ones cost fifty times as many triangles."""
+"""Rods up to this radius, m, are drawn as strokes: round ones cost hundreds of times as many triangles."""
+_SHEER = 0.99
+"""MuJoCo draws strokes that are quite opaque in white."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,14 +42,17 @@ class Label:
 
 
 class Brush:
-    """Adds geoms to a scene until it is full.
+    """Adds geoms to a scene until it is full, for a camera and a picture so many pixels high.
 
     Attributes:
         labels: what was written so far.
     """
 
-    def __init__(self, scene: mujoco.MjvScene) -> None:
+    def __init__(self, scene: mujoco.MjvScene, camera: Camera, height: int) -> None:
         self._scene = scene
+        self._eye = camera.target - camera.distance * camera.ahead
+        self._ahead = camera.ahead
+        self._focal = focal_length(height)
         self.labels: list[Label] = []
 
     def ball(
@@ -78,11 +84,10 @@ class Brush:
             geom = self._add(kind, (width,) * 3, _NOWHERE, _UPRIGHT, colour, alpha, glow)
             mujoco.mjv_connector(geom, int(kind), width, start, end)
             return
-        half, quaternion, frame = (end - start) / 2, np.empty(4), np.empty(9)
-        mujoco.mju_quatZ2Vec(quaternion, half)
-        mujoco.mju_quat2Mat(frame, quaternion)
-        size = (0.85 * width, 0.85 * width, float(np.linalg.norm(half)))
-        self._add(mujoco.mjtGeom.mjGEOM_BOX, size, start + half, frame, colour, alpha, glow)
+        kind = mujoco.mjtGeom.mjGEOM_LINE
+        geom = self._add(kind, (width,) * 3, _NOWHERE, _UPRIGHT, colour, min(alpha, _SHEER), 0.0)
+        depth = max(0.1, float(((start + end) / 2 - self._eye) @ self._ahead))
+        mujoco.mjv_connector(geom, int(kind), max(1.0, 2 * width * self._focal / depth), start, end)
 
     def dashes(
         self,

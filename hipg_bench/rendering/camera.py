@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
@@ -28,6 +29,13 @@ class Camera:
     azimuth: float
     elevation: float
 
+    @functools.cached_property
+    def ahead(self) -> Float[np.ndarray, "3"]:
+        """Where it looks, a unit vector."""
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        level = np.cos(elevation)
+        return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+
     def mujoco(self) -> mujoco.MjvCamera:
         """The same for MuJoCo."""
         camera = mujoco.MjvCamera()
@@ -40,17 +48,18 @@ class Camera:
         self, places: Float[np.ndarray, "n 3"], width: int, height: int
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
         """Pixels from the upper left corner, and depth along the view, m (negative behind the camera)."""
-        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
-        ahead = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
+        ahead, azimuth = self.ahead, np.radians(self.azimuth)
         right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
         up = np.cross(right, ahead)
         gap = places - (self.target - self.distance * ahead)
         depth = gap @ ahead
-        focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
-        scale = focal / np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+        scale = focal_length(height) / np.where(np.abs(depth) < 1e-9, 1e-9, depth)
         return np.stack([width / 2 + scale * (gap @ right), height / 2 - scale * (gap @ up)], axis=-1), depth
+
+
+def focal_length(height: int) -> float:
+    """Pixels that 1 m takes at a depth of 1 m, in a picture so many pixels high."""
+    return height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
 
 
 def follow(time: np.ndarray, place: Float[np.ndarray, "K 3"], smoothing: float) -> Float[np.ndarray, "K 3"]:

@@ -75,7 +75,7 @@ class Drones:
             died, colour = float(self.footage.lifetime[agent]), self.cast.colour[agent]
             if time - died < _TRAIL:
                 start, end = max(time - _TRAIL, 0.0), min(time, died)
-                brush.trail(self.footage.path(int(self.cast.root[agent]), start, end, 22), 0.007, colour, 0.7)
+                brush.trail(self.footage.path(int(self.cast.root[agent]), start, end, 16), 0.007, colour, 0.7)
             if time < died and not self._ceiling:
                 # some particles are as small as 1 cm
                 brush.ball(place, 0.03, colour, 0.5)
@@ -91,17 +91,17 @@ class Drones:
             brush.ball(centre, radius, red, 0.09, glow=0.7)
             for axes in ((_X, _Y), (_X, _Z), (_Y, _Z)):
                 brush.ring(
-                    centre, radius, 0.0028, red, 0.6, axes=axes, pieces=48, dashed=True, turn=0.15 * time
+                    centre, radius, 0.0028, red, 0.6, axes=axes, pieces=40, dashed=True, turn=0.15 * time
                 )
             brush.write(top, "hidden hazard", palette.blend(red, WHITE, 0.45))
             return
         beat = 0.5 + 0.5 * np.cos(2 * np.pi * 0.9 * revealed_for)
         for share, alpha in ((1.0, 0.13 + 0.06 * beat), (0.68, 0.14), (0.36, 0.20)):
             brush.ball(centre, radius * share, red, alpha, glow=0.8)
-        brush.ring(centre, radius, 0.0045, red, 0.95, pieces=56)
+        brush.ring(centre, radius, 0.0045, red, 0.95, pieces=40)
         if revealed_for < 0.8:
             share = revealed_for / 0.8
-            brush.ring(centre, radius * (0.3 + 1.5 * share), 0.006, red, 0.9 * (1 - share), pieces=56)
+            brush.ring(centre, radius * (0.3 + 1.5 * share), 0.006, red, 0.9 * (1 - share), pieces=40)
         brush.write(top, "HAZARD", palette.blend(red, WHITE, 0.25), strong=True)
 
     def tint(self, prefix: str, colour: np.ndarray, *, but: tuple[str, ...] = ()) -> None:

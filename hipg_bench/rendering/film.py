@@ -15,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -45,6 +46,8 @@ _ENDS = {
     "all_fallen": "everyone has fallen",
 }
 """End reasons in plain words; others are shown as they are."""
+
+T = TypeVar("T")
 
 Progress = Callable[[int, int], None]
 """Told how many frames of how many are done."""
@@ -188,18 +191,31 @@ def _frames(job: Job, rows: Float[np.ndarray, "K R"]) -> Iterator[tuple[bytes, i
     times = moments(footage.time, pace, job.fps)
     held = round(_CARD * job.fps)
     total = len(times) + held
+
+    def paint() -> Iterator[tuple[Any, ...]]:
+        with Painter(stage, job.width, job.height) as painter:
+            for time in times.tolist():
+                frame, camera, labels, status = painter.paint(time)
+                now = footage.remembered(time)
+                yield frame, camera, labels, Reading(time, float(now["return"][0]), now["health"], status)
+
     picture = hud.blank
-    with Painter(stage, job.width, job.height) as painter:
-        for time in times.tolist():
-            frame, camera, labels, status = painter.paint(time)
-            now = footage.remembered(time)
-            reading = Reading(time, float(now["return"][0]), now["health"], status)
-            picture = hud.write(frame, camera, labels, reading)
-            yield picture.tobytes(), total
+    for painted in ahead(paint()):
+        picture = hud.write(*painted)
+        yield picture.tobytes(), total
     headline, lines = _ending(job, footage.remembered(footage.time[-1]))
     for k in range(held):
         share = min(1.0, (k + 1) / max(1, round(_FADE_IN * job.fps)))
         yield hud.end_card(picture, share, headline, lines).tobytes(), total
+
+
+def ahead(items: Iterator[T]) -> Iterator[T]:
+    """The same items, each made in a thread of its own while the one before is dealt with."""
+    with ThreadPoolExecutor(1) as maker:
+        coming = maker.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = maker.submit(next, items, None)
+            yield item
 
 
 def _ending(job: Job, end: Mapping[str, np.ndarray]) -> tuple[str, tuple[str, str]]:

@@ -54,5 +54,5 @@ class Painter:
         for light in scene.lights[: scene.nlight]:
             if not light.headlight:
                 light.pos[:2] += camera.target[:2]
-        labels, status = stage.decorate(scene, time)
+        labels, status = stage.decorate(scene, time, self._renderer.height)
         return renderer.render().copy(), camera, labels, status

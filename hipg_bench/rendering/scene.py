@@ -60,9 +60,11 @@ class Stage:
         self.cast.dress(time)
         self._look.dress(time)
 
-    def decorate(self, scene: mujoco.MjvScene, time: float) -> tuple[list[Label], list[Status]]:
-        """Add to a scene what is in no model; return what to write on the picture."""
-        brush = Brush(scene)
+    def decorate(
+        self, scene: mujoco.MjvScene, time: float, height: int = 720
+    ) -> tuple[list[Label], list[Status]]:
+        """Add to a scene what is in no model, for so many pixels; return what to write on the picture."""
+        brush = Brush(scene, self.camera(time), height)
         mark_agents(brush, self._look, self.cast, self.footage, time)
         return brush.labels, self._look.decorate(brush, time)
 
