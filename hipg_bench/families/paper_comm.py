@@ -113,6 +113,9 @@ class PaperComm(particles.Particles[Snapshot]):
         now.connected = self._connected(now)
         field["connected"][:, 0] = now.connected
         field["connected_steps"][:, 0] += now.connected
+        if not self._law.collision_risk:  # else they are counted already
+            alive = was.health > 0
+            plane.count_overlaps(now.position, alive, 2 * self.radius, np.empty(alive.shape), now.overlaps)
         field["collisions"][:, 0] += now.overlaps[:, 0]
         self._keep(sim, was, now)
         return now

@@ -98,7 +98,8 @@ class PaperNav(particles.Particles[Snapshot]):
         particles.place(sim, ids, start, half)
         sim.marker[ids, :, :2] = (half * (2 * where - 1)).reshape(-1, points, 2)
         sim.field["hazardous"][ids] = rank.argsort(axis=1) < self.params.hazards
-        sim.field["revealed"][ids] = self.read(sim, ids).exposed.any(axis=1)
+        world, _, point = self.read(sim, ids).exposed
+        sim.field["revealed"][ids[world], point] = 1
 
     def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
         """Positions do not lag behind the physics: they are generalised coordinates."""
@@ -112,7 +113,8 @@ class PaperNav(particles.Particles[Snapshot]):
 
     def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
         """A hazard is revealed for good once an agent, dead or alive, is within its radius."""
-        now.revealed |= now.exposed.any(axis=1)
+        world, _, point = now.exposed
+        now.revealed[world, point] = True
         alive = now.health > 0
         plane.count_overlaps(now.position, alive, 2 * self.radius, np.empty(alive.shape), now.overlaps)
         covers = np.ones_like(alive) if self.params.dead_cover else alive

@@ -69,7 +69,7 @@ class Snapshot:
     velocity: Float[np.ndarray, "B N 2"]  # m/s; of the dead, the one they died with
     health: Float[np.ndarray, "B N"]
     point: Float[np.ndarray, "B L 2"]  # landmarks, or terminals and the hazard, m
-    exposed: Bool[np.ndarray, "B N L"]  # agents in hazards
+    exposed: tuple[Int[np.ndarray, "M"], ...]  # world, agent, point: the M cases of an agent in a hazard
     sim: Sim  # from where it was read
     rows: Rows
     overlaps: Float[np.ndarray, "B 2"]  # pairs that overlap, of which both live, and of which one does
@@ -199,7 +199,7 @@ class Particles(abc.ABC, Generic[S]):
             "position": position,
             "velocity": velocity.reshape(-1, n, 2),
             "point": point,
-            "exposed": exposed,
+            "exposed": few(exposed),
             "overlaps": np.zeros((len(health), 2)),  # once it is known who lives
             "sim": sim,
             "rows": rows,
@@ -218,7 +218,7 @@ class Particles(abc.ABC, Generic[S]):
     def _burn(self, now: S) -> Float[np.ndarray, "B N"]:
         """Exposure of each agent from the hazards it is in, nats."""
         burn, law = np.zeros(now.health.shape), self._law
-        world, agent, point = few(now.exposed)
+        world, agent, point = now.exposed
         if len(world):
             gap = now.point[world, point] - now.position[world, agent]
             risk = hazards.risk(np.hypot(*gap.T), law.hazard_radius, law.hazard_peak)
@@ -227,7 +227,9 @@ class Particles(abc.ABC, Generic[S]):
 
     def _crash(self, now: S, alive: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
         """Exposure of each agent from its contacts, nats."""
-        touching = np.empty(alive.shape)
+        touching = np.zeros(alive.shape)
+        if not self._law.collision_risk:
+            return touching
         plane.count_overlaps(now.position, alive, 2 * self.radius, touching, now.overlaps)
         return -np.log1p(-self._law.collision_risk) * touching
 

@@ -27,10 +27,16 @@ LISTED = 5
 
 
 @compiled
+def square(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
+    """Squared distance between two places."""
+    x, y = b[0] - a[0], b[1] - a[1]
+    return x * x + y * y
+
+
+@compiled
 def gap(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
     """Distance between two places."""
-    x, y = b[0] - a[0], b[1] - a[1]
-    return math.sqrt(x * x + y * y)
+    return math.sqrt(square(a, b))
 
 
 @compiled
@@ -195,8 +201,8 @@ def sum_gaps(
                 nearest = math.inf
                 for i in range(agents):
                     if covers[world, i]:
-                        nearest = min(nearest, gap(position[world, i], point[world, k]))
-                total[world] += nobody if nearest == math.inf else nearest
+                        nearest = min(nearest, square(position[world, i], point[world, k]))
+                total[world] += nobody if nearest == math.inf else math.sqrt(nearest)
 
 
 @compiled
