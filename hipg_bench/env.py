@@ -40,8 +40,7 @@ class Step:
         truncated: (B,) the horizon ended it.
         info: ``state`` (B, S) float32; ``health`` (B, N); ``alive`` (B, N) bool; ``terms`` name to (B,),
             weighted, their sum is the reward; ``final_observation`` (B, N, O), ``final_state`` (B, S) and
-            ``final_alive`` (B, N), those of the step itself, whether or not an episode ended (where none did,
-            the very arrays that ``observation`` and ``state`` are); ``metrics``
+            ``final_alive`` (B, N), those of the step itself, whether or not an episode ended; ``metrics``
             name to (B,), NaN but where an episode ended; ``end_reason`` (B,) str, empty but there;
             ``episode_id`` (B,) and ``elapsed`` (B,) control steps of the episode that the observation is of;
             ``final_rows`` (n, R) last rows of the n worlds whose episode ended, in their order.
@@ -198,8 +197,8 @@ class BatchEnv:
             "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, ended),
             "final_rows": sim.rows[ended],
         }  # fmt: skip
+        observation, state = observation.copy(), state.copy()
         if len(ended) and self._autoreset:
-            observation, state = observation.copy(), state.copy()
             self._begin(ended, self._next_episode + np.arange(len(ended)))
             fresh = family.read(sim, ended)
             observation[ended], state[ended] = self._perceive(fresh)
