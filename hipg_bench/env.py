@@ -17,6 +17,7 @@ from hipg_bench.families.family import Family
 from hipg_bench.families.scene import without_visuals
 from hipg_bench.layout import TaskLayout
 from hipg_bench.mechanics import health as health_law
+from hipg_bench.native import copied
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec
 
@@ -197,7 +198,7 @@ class BatchEnv:
             "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, ended),
             "final_rows": sim.rows[ended],
         }  # fmt: skip
-        observation, state = observation.copy(), state.copy()
+        observation, state = copied(observation, sim.threads), state.copy()
         if len(ended) and self._autoreset:
             self._begin(ended, self._next_episode + np.arange(len(ended)))
             fresh = family.read(sim, ended)
