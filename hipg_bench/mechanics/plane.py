@@ -40,6 +40,15 @@ def gap(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
 
 
 @compiled
+def anyone_near(position: Float[np.ndarray, "N 2"], i: int, reach: float) -> bool:
+    """Whether any agent of a higher number may be within reach, m: a first look, without branches."""
+    count, limit = 0, reach * reach * (1 + 1e-9)
+    for j in range(i + 1, len(position)):
+        count += 1 if square(position[i], position[j]) < limit else 0
+    return count > 0
+
+
+@compiled
 def push_apart(
     position: Float[np.ndarray, "B N 2"],
     solid: Bool[np.ndarray, "B N"],
@@ -63,11 +72,14 @@ def push_apart(
     """
     force[:] = 0.0
     worlds, agents, _ = position.shape
+    far = reach + _FADE * margin
     for world in range(worlds):
         for i in range(agents):
+            if not anyone_near(position[world], i, far):
+                continue
             for j in range(i + 1, agents):
                 distance = gap(position[world, i], position[world, j])
-                if 0 < distance < reach + _FADE * margin and solid[world, i] and solid[world, j]:
+                if 0 < distance < far and solid[world, i] and solid[world, j]:
                     depth = (reach - distance) / margin
                     softplus = max(depth, 0.0) + math.log1p(math.exp(-abs(depth)))
                     for axis in range(2):
@@ -99,6 +111,8 @@ def count_overlaps(
     worlds, agents, _ = position.shape
     for world in range(worlds):
         for i in range(agents):
+            if not anyone_near(position[world], i, reach):
+                continue
             for j in range(i + 1, agents):
                 if gap(position[world, i], position[world, j]) < reach:
                     if alive[world, i] and alive[world, j]:
@@ -346,14 +360,14 @@ def list_nearest(
         row: written into, from its beginning.
         slots: how many things at most.
     """
-    last, far = -1, -1.0  # what was listed last
+    last, far = -1, -1.0  # what was listed last, and its squared distance
     for slot in range(slots):
         which, nearest = -1, math.inf
         for k in range(len(counts)):
             if counts[k]:
-                distance = gap(here, thing[k])
-                if (distance > far or (distance == far and k > last)) and distance < nearest:
-                    which, nearest = k, distance
+                away = square(here, thing[k])
+                if (away > far or (away == far and k > last)) and away < nearest:
+                    which, nearest = k, away
         if which < 0:
             break
         last, far = which, nearest
