@@ -214,6 +214,10 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
         ResumeError: it belongs to another evaluation.
     """
     path = out / "run.json"
+    for folder in (out, *out.glob("*/")):
+        # half-written files of a process that was killed
+        for leftover in folder.glob(".*-[0-9]*.*"):
+            leftover.unlink()
     if path.exists():
         earlier = json.loads(path.read_text(encoding="utf-8"))
         for name, value in run.items():
