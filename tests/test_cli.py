@@ -230,3 +230,24 @@ def test_lists():
         assert task in text
         assert spec.summary in text
     assert run("agents", "show", "random").returncode == 0
+
+
+def test_all_splits_come_to_lie_side_by_side_and_are_exported(tmp_path):
+    done = run(
+        "evaluate", "--agent", "random", "--tasks", TASK, "--episodes", 2, "--video", 0, "--split", "all",
+        "--out", tmp_path / "all",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    folders = sorted(path.name for path in (tmp_path / "all").iterdir())
+    assert folders == ["ad_hoc", "forced_death", "shift", "standard"]
+    for name in folders:
+        row = json.loads((tmp_path / "all" / name / f"episodes/{TASK}.jsonl").read_text().splitlines()[0])
+        assert row["split"] == name
+        assert json.loads((tmp_path / "all" / name / "results.json").read_text())["split"] == name
+    done = run("export", *sorted((tmp_path / "all").iterdir()), "--out", tmp_path / "out.json")
+    assert done.returncode == 0, done.stderr
+    assert set(json.loads((tmp_path / "out.json").read_text())) == {
+        "hipg_bench", "hipg_bench_ad_hoc", "hipg_bench_forced_death", "hipg_bench_shift",
+    }  # fmt: skip
+    done = run("evaluate", "--agent", "random", "--split", "shft", "--out", tmp_path / "no")
+    assert (done.returncode, "did you mean 'shift'?" in done.stderr) == (2, True)

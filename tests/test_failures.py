@@ -159,6 +159,9 @@ def test_a_longer_evaluation_plays_what_a_dnf_left(tmp_path):
     name = f"episodes/{SPEC.task}.jsonl"
     first = runner.evaluate(agent, suite, tmp_path / "a", Plan(episodes=10, threads=1))
     assert first["tasks"][0]["failures"] == {"crash": 1, "not_played": 7}
+    page = (tmp_path / "a/report.html").read_text()
+    assert "DNF" in page
+    assert "crash 1, not played 7" in page
     again = runner.evaluate(agent, suite, tmp_path / "a", Plan(episodes=21, threads=1))
     runner.evaluate(agent, suite, tmp_path / "b", Plan(episodes=21, threads=1))
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()

@@ -48,7 +48,7 @@ def summarise(spec: TaskSpec, rows: Sequence[Row]) -> dict[str, Any]:
         "return_by_deaths": _by_deaths(played),
         "physics": sum(row["end_reason"] == "physics" for row in rows),
         "failures": _count(row["status"] for row in rows if row["status"] != OK),
-        "end_reasons": _count(row["end_reason"] for row in rows),
+        "end_reasons": _count(row["end_reason"] for row in played),
         "death_causes": _count(death["cause"] for row in rows for death in row["death_list"]),
         "metrics": {name: _mean(row["metrics"][name] for row in rows) for name in rows[0]["metrics"]},
         "anchors": spec.anchors.model_dump(mode="json") if spec.anchors else None,
