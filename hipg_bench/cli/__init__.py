@@ -16,6 +16,7 @@ from hipg_bench.cli import (
     bench,
     calibrate,
     collect,
+    compare,
     doctor,
     evaluate,
     export,
@@ -36,6 +37,7 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
 )
 app.command()(evaluate.evaluate)
+app.command()(compare.compare)
 app.command()(export.export)
 app.command()(train.train)
 app.command()(collect.collect)

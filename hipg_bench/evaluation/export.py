@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hipg_bench.errors import HipgError
+from hipg_bench.evaluation.comparing import read
 from hipg_bench.evaluation.episodes import Row
 from hipg_bench.evaluation.results import SCHEMA
 from hipg_bench.evaluation.splits import STANDARD
@@ -48,12 +49,9 @@ def marl_eval(folders: Sequence[Path]) -> Document:
 
 
 def _results(folder: Path) -> dict[str, Any]:
-    path = folder / "results.json"
-    if not path.is_file():
-        raise HipgError(f"{folder} holds no results.json: it is not a finished evaluation")
-    results = json.loads(path.read_text(encoding="utf-8"))
+    results = read(folder)
     if results.get("schema") != SCHEMA:
-        raise HipgError(f"{path}: schema {SCHEMA} is allowed, got {results.get('schema')}: evaluate again")
+        raise HipgError(f"{folder}: schema {SCHEMA} is allowed, got {results.get('schema')}: evaluate again")
     return results
 
 

@@ -16,7 +16,8 @@ Kind = Literal["method", "checkpoint", "reference"]
 """A ``method`` was trained with at least 5 seeds for every task that it plays; a ``checkpoint`` with fewer.
 A ``reference`` comes with the benchmark, is not trained, and has no place."""
 
-_ORDER: tuple[Kind, ...] = ("method", "checkpoint", "reference")
+ORDER: tuple[Kind, ...] = ("method", "checkpoint", "reference")
+"""Of kinds in a table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +60,7 @@ def rank(entries: Mapping[str, Mapping[str, Any]]) -> list[Standing]:
         raise HipgError(f"results of one suite and split are ranked, got {sorted(what)}")
     standings: list[Standing] = []
     place = 0
-    for kind in _ORDER:
+    for kind in ORDER:
         group = [(name, r["aggregate"]) for name, r in entries.items() if r["kind"] == kind]
         group.sort(key=lambda one: (-_value(one[1]), one[0]))
         for name, whole in group:

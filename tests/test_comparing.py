@@ -1,13 +1,15 @@
-"""marl-eval's JSON, as its own loader reads it."""
+"""Evaluations side by side, and as marl-eval's own loader reads them."""
 
 import json
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hipg_bench import task_spec
+from hipg_bench.cli import app
 from hipg_bench.errors import HipgError
-from hipg_bench.evaluation import runner
+from hipg_bench.evaluation import comparing, runner
 from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.evaluation.export import marl_eval
 from hipg_bench.policies.bundle import load_agent
@@ -62,3 +64,34 @@ def test_bad_folders_are_refused(folders, tmp_path):
     (tmp_path / "results.json").write_text('{"schema": 1}')
     with pytest.raises(HipgError, match="schema 2 is allowed, got 1"):
         marl_eval([tmp_path])
+
+
+def test_two_agents_are_compared_in_the_same_worlds(folders):
+    found = comparing.differences(folders / "random-standard", folders / "zero-standard")
+    assert set(found) == set(TASKS)
+    for task, (difference, (low, high)) in found.items():
+        scores = {
+            name: [
+                json.loads(line)["score"]
+                for line in (folders / f"{name}-standard/episodes/{task}.jsonl").read_text().splitlines()
+            ]
+            for name in ("random", "zero")
+        }
+        gaps = np.subtract(scores["random"], scores["zero"])
+        assert difference == pytest.approx(gaps.mean())
+        # of three worlds drawn with replacement the extremes are three times the same
+        assert gaps.min() - 1e-9 <= low <= high <= gaps.max() + 1e-9
+    with pytest.raises(HipgError, match="are of other worlds: split is standard and forced_death"):
+        comparing.differences(folders / "zero-standard", folders / "zero-forced_death")
+
+
+def test_the_comparison_is_printed(folders):
+    done = CliRunner().invoke(
+        app, ["compare", str(folders / "random-standard"), str(folders / "zero-standard")]
+    )
+    assert done.exit_code == 0, done.output
+    assert "P(improvement)" in done.output
+    # neither is trained, so neither has a place
+    assert done.output.count("reference") == 2
+    for task in TASKS:
+        assert task in done.output
