@@ -31,13 +31,14 @@ def start(folder: Path) -> Start:
         program, "--unshare-all", "--die-with-parent", "--new-session", "--clearenv", "--cap-drop", "ALL",
         "--uid", _NOBODY, "--gid", _NOBODY, "--hostname", "agent",
         *(part for name, value in ENVIRONMENT.items() for part in ("--setenv", name, value)),
+        "--size", str(_SPACE), "--tmpfs", "/tmp",  # first: an environment may lie in /tmp
         *(part for path in seen for part in ("--ro-bind", str(path), str(path))),
         *(part for path in links for part in ("--symlink", str(path.readlink()), str(path))),
         *(part for path in _DEVICES for part in ("--dev-bind", path, path)),
         *(part for path in _FACTS for part in ("--ro-bind-try", path, path)),
         "--ro-bind-try", "/etc/ld.so.cache", "/etc/ld.so.cache",
         "--ro-bind", str(folder.resolve()), str(_FOLDER), "--ro-bind", str(INSIDE), str(_INSIDE),
-        "--size", str(_SPACE), "--tmpfs", "/tmp", "--remount-ro", "/", "--chdir", "/tmp",
+        "--remount-ro", "/", "--chdir", "/tmp",
         *python(_INSIDE),
     ]  # fmt: skip
     return Start(
