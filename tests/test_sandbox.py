@@ -159,6 +159,21 @@ def test_where_bwrap_is_missing_the_line_that_mends_it_is_named(monkeypatch, tmp
         bubblewrap.start(tmp_path)
 
 
+def test_an_environment_in_tmp_stays_visible(monkeypatch, tmp_path):
+    """Where packages lie below /tmp, the child's own /tmp must not hide them."""
+    agent, more = tmp_path / "agent", tmp_path / "more"
+    agent.mkdir()
+    more.mkdir()
+    (more / "installed_module.py").write_text("")
+    (agent / "agent.py").write_text("import installed_module\nraise SystemExit('found')\n")
+    for name in WORKING:
+        module = {"bubblewrap": bubblewrap, "landlock": landlock}[name]
+        known = module.packages()
+        monkeypatch.setattr(module, "packages", lambda known=known: [*known, more])
+        with pytest.raises(AgentFailure, match="found"):
+            Child(choice.BACKENDS[name], agent, _SETUP, Budget()).ask({"do": "reset"}, [], 20.0)
+
+
 def test_a_child_that_cannot_start_is_the_hosts_fault(tmp_path):
     for command, reason in (
         ([str(tmp_path / "no-such-program")], "could not be started"),
