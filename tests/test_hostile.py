@@ -117,6 +117,14 @@ def test_a_hostile_agent_gains_nothing_and_harms_nobody(scene, honest, monkeypat
     assert rows[1]["return"] == TASK.floor
 
 
+def test_without_a_sandbox_the_salt_would_be_found(scene):
+    """The attacker is able: it is the sandbox that stops it."""
+    folder, targets = scene
+    _agent("salt_finder", folder, targets)
+    rows = PLAN.play_all(TASK, policy(folder, trust=True))
+    assert [row["status"] for row in rows] == ["crash", "not_played"]
+
+
 def test_an_idle_agent_plays_and_scores_less(scene, honest):
     rows = PLAN.play_all(TASK, _agent("idle", *scene))
     assert [row["status"] for row in rows] == ["ok", "ok"]
