@@ -209,6 +209,15 @@ def test_clocks_are_the_parents(tmp_path):
         step(policy(tmp_path, "import time; time.sleep(100)", budget=Budget(start_up=1.0)))
 
 
+def test_of_a_flood_of_words_the_last_are_kept(tmp_path):
+    body = "print('word ' * 100_000)\nraise ValueError('the reason')"
+    with pytest.raises(
+        AgentFailure, match=r"(?s)ValueError: the reason.*word word.*ValueError: the reason"
+    ) as failed:
+        step(policy(tmp_path, acting(body)))
+    assert len(str(failed.value)) < 4000
+
+
 def test_a_batch_may_take_what_its_worlds_may_take_one_by_one():
     budget = Budget()
     assert budget.deadline(1) == pytest.approx(2.0)

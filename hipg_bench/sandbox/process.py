@@ -1,7 +1,7 @@
 """A child process from the parent's side: pipes that never block, clocks that the child cannot touch.
 
 All that comes from the child is untrusted: lengths are checked before anything is kept, and of what it
-prints 64 KB are kept and the rest is read and dropped, so that it can neither block nor fill memory.
+prints the last 64 KB are kept and the rest is dropped, so that it can neither block nor fill memory.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Child:
     """One confined process.
 
     Attributes:
-        words: what it printed, the first 64 KB.
+        words: what it printed, the last 64 KB.
     """
 
     def __init__(self, backend: Backend, folder: Path, setup: Mapping[str, Any], budget: Budget) -> None:
@@ -208,7 +208,8 @@ class Child:
                 with contextlib.suppress(KeyError):
                     self._poll.unregister(self._err)
                 return
-            self.words += chunk[: self._budget.words - len(self.words)]
+            self.words += chunk
+            del self.words[: -self._budget.words]
 
     def _how(self) -> str:
         """With which signal or status it ended."""
