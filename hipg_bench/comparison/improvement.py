@@ -14,9 +14,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from hipg_bench.evaluation import statistics
+
 _REPS = 5_000
 
-Stratum = tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_"]]
+Values = Float[np.ndarray, "_"]
+Stratum = tuple[Values, Values]
 """Values x and y of one task."""
 
 
@@ -38,29 +41,18 @@ class Improvement:
 
 def improvement(strata: Sequence[Stratum], *, reps: int = _REPS, seed: int = 1) -> Improvement:
     """Compare x with y; every stratum needs a value of each."""
+    ours, theirs = [x for x, _ in strata], [y for _, y in strata]
+    p = float(statistics.improvement(ours, theirs))
     chance = np.random.default_rng(seed)
-    p = float(np.mean([_above(x[None], y[None])[0] for x, y in strata]))
-    drawn = np.mean([_above(_redrawn(x, reps, chance), _redrawn(y, reps, chance)) for x, y in strata], axis=0)
-    shuffled = np.mean([_shuffled(x, y, reps, chance) for x, y in strata], axis=0)
-    low, high = np.percentile(drawn, [2.5, 97.5])
+    dealt = [_dealt(x, y, reps, chance) for x, y in strata]
+    shuffled = statistics.improvement([x for x, _ in dealt], [y for _, y in dealt])
     # the data themselves are one of the ways in which labels may fall
     as_far = np.abs(shuffled - 0.5) >= abs(p - 0.5) - 1e-12
-    return Improvement(p, (float(low), float(high)), float((1 + as_far.sum()) / (1 + reps)))
+    interval = statistics.improvement_ci95(ours, theirs, reps=reps, seed=seed)
+    return Improvement(p, interval, float((1 + as_far.sum()) / (1 + reps)))
 
 
-def _above(x: Float[np.ndarray, "R n"], y: Float[np.ndarray, "R m"]) -> Float[np.ndarray, "R"]:
-    """Share of pairs with x above y, ties half."""
-    difference = x[:, :, None] - y[:, None, :]
-    return ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(1, 2))
-
-
-def _redrawn(x: Float[np.ndarray, "n"], reps: int, chance: np.random.Generator) -> np.ndarray:
-    return x[chance.integers(len(x), size=(reps, len(x)))]
-
-
-def _shuffled(
-    x: Float[np.ndarray, "n"], y: Float[np.ndarray, "m"], reps: int, chance: np.random.Generator
-) -> Float[np.ndarray, "R"]:
-    """P where labels mean nothing."""
+def _dealt(x: Values, y: Values, reps: int, chance: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The same values, dealt to the two sides at random."""
     drawn = chance.permuted(np.tile(np.concatenate([x, y]), (reps, 1)), axis=1)
-    return _above(drawn[:, : len(x)], drawn[:, len(x) :])
+    return drawn[:, : len(x)], drawn[:, len(x) :]

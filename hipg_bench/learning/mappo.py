@@ -25,6 +25,7 @@ from hipg_bench.env import BatchEnv, Step
 from hipg_bench.errors import BundleError
 from hipg_bench.layout import TaskLayout
 from hipg_bench.learning import credit
+from hipg_bench.learning.forks import Forks
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
@@ -78,6 +79,7 @@ class Trainer:
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, eps=1e-5)
         self.iteration = 0
         self.step: Step = self.env.reset()
+        self.forks = Forks(settings, self.env) if settings.forks and settings.arm != "local" else None
 
     def iterate(self) -> dict[str, float]:
         """One round of algorithm 1: roll out, value targets, credit, update. Returns what to log."""
@@ -125,6 +127,8 @@ class Trainer:
             data.action[t] = policy.sample()
             data.log_prob[t] = policy.log_prob(data.action[t]).sum(-1)
             now = self.step = env.step(data.action[t].numpy())
+            if self.forks is not None:
+                self.forks.play(self.actor, env)
             if settings.zero_dead_actions:
                 data.action[t][data.health[t] == 0] = 0.0
             data.reward[t] = torch.from_numpy(now.reward)
@@ -251,8 +255,12 @@ class Trainer:
         seen, elapsed = self._shown(data.observation, data.state, data.elapsed)
         with torch.no_grad():
             inputs = self.critic.inputs(seen, elapsed).flatten(0, -2)
-            before = self.critic.normalized(inputs)
             aim = (target.flatten() - returns.offset) / returns.scale
+            if self.forks is not None:
+                state, when, value = self.forks.harvest(self.critic)
+                inputs = torch.cat([inputs, self.critic.inputs(state, when).flatten(0, -2)])
+                aim = torch.cat([aim, (value.flatten() - returns.offset) / returns.scale])
+            before = self.critic.normalized(inputs)
         reach = settings.value_clip and settings.value_clip / float(returns.scale)
         error = 0.0
         for _ in range(settings.epochs):
@@ -305,6 +313,8 @@ class Trainer:
             "random": torch.get_rng_state(),
             "worlds": torch.from_numpy(self.env.rows),
         }
+        if self.forks is not None:
+            content["forks"] = torch.from_numpy(self.forks.env.rows)
         with replacing(path) as temporary:
             torch.save(content, temporary)
 
@@ -322,6 +332,8 @@ class Trainer:
         self.actor_optimizer.load_state_dict(content["actor_optimizer"])
         self.critic_optimizer.load_state_dict(content["critic_optimizer"])
         self.step = self.env.load_rows(np.arange(self.env.num_envs), content["worlds"].numpy())
+        if self.forks is not None:
+            self.forks.go_on(content["forks"].numpy())
         torch.set_rng_state(content["random"])
 
 

@@ -104,6 +104,8 @@ class Settings(RunSettings):
             horizon counts as an end, as in the authors' code.
         spontaneous_deaths: agents per episode, in the mean, that die without a cause, in training only,
             so that the critic meets the states its counterfactual is about.
+        forks: worlds beside the rollout's in which an agent was killed, as a share of ``num_envs``; only
+            the critic learns from them (`hipg_bench.learning.forks`).
     """
 
     arm: Literal["min_health", "central", "local"] = "min_health"
@@ -128,6 +130,7 @@ class Settings(RunSettings):
     normalize_returns: bool = True
     bootstrap_truncation: bool = True
     spontaneous_deaths: float = pydantic.Field(default=0.0, ge=0, le=10)
+    forks: float = pydantic.Field(default=0.0, ge=0, le=1)
 
 
 class ReplaySettings(RunSettings):
