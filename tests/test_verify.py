@@ -12,7 +12,7 @@ import time
 import pytest
 
 from hipg_bench.errors import BoardError, BundleError, ResumeError
-from hipg_bench.evaluation import runner
+from hipg_bench.evaluation import protocol, runner
 from hipg_bench.leaderboard import adding
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.playing import Match
@@ -29,6 +29,7 @@ from hipg_bench.submissions import archive
 TASK = "hazard_nav-4"
 MATCH = Match((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
 SHORT = Match((TASK,), ("standard",), episodes=3, threads=1)
+FROZEN = not protocol.differences()
 SANDBOXED = any(trial.works for trial in choice.trials().values())
 
 
@@ -69,6 +70,19 @@ def zipped(folder):
 def add(board, what, match=MATCH, trust=False, **options):
     with opened(what, trust=trust) as source:
         return adding.add(board, source, match, **options).entry
+
+
+@pytest.fixture(autouse=True)
+def frozen(monkeypatch):
+    """Whether the tree is the frozen suite is another test's business."""
+    monkeypatch.setattr(protocol, "differences", list)
+
+
+def test_a_tree_that_is_not_the_frozen_suite_verifies_nothing(board, salted, monkeypatch):
+    monkeypatch.setattr(protocol, "differences", lambda: ["tasks.x: floor was -1, is -2"])
+    with pytest.raises(BoardError, match=r"the tree is not hipg-1.*floor was -1, is -2"):
+        verify(board, "newcomer", salted[1], threads=1)
+    assert board.entry("newcomer").verification is None
 
 
 @pytest.fixture(scope="module")
@@ -317,8 +331,12 @@ def test_the_commands_from_a_zip_to_a_page(tmp_path):
     assert "has an entry 'newcomer' already" in again.stderr
     assert "Traceback" not in again.stderr
     checked = run("verify", "newcomer", "--salt-file", salt, "--board", board)
-    assert checked.returncode == 0, checked.stderr
-    assert "newcomer: verified, decentralised, sandbox not needed" in checked.stdout
+    if FROZEN:
+        assert checked.returncode == 0, checked.stderr
+        assert "newcomer: verified, decentralised, sandbox not needed" in checked.stdout
+    else:
+        assert checked.returncode == 2
+        assert "the tree is not hipg-1" in checked.stderr
     assert run("build", "--out", tmp_path / "site", "--board", board).returncode == 0
     assert "newcomer" in (tmp_path / "site" / "index.html").read_text()
     typo = run("verify", "newcommer", "--salt-file", salt, "--board", board)

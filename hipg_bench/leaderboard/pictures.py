@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from hipg_bench.evaluation import splits
+from hipg_bench.evaluation.ranking import better
+from hipg_bench.evaluation.statistics import CLIP, Interval
 from hipg_bench.leaderboard.charts import Chart, Series, chart
 from hipg_bench.leaderboard.shown import Shown
 from hipg_bench.leaderboard.standings import Line, Panel
@@ -16,7 +16,6 @@ from hipg_bench.spec import TaskSpec
 
 COLOURS = 8
 """Entries that a chart can tell apart."""
-_PROFILE = np.linspace(-0.25, 1.25, 121)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,11 +24,11 @@ class Better:
 
     Attributes:
         names: of rows and columns.
-        shares: by row, then column; None on the diagonal.
+        shares: by row, then column, each with its interval; None on the diagonal.
     """
 
     names: Sequence[str]
-    shares: Sequence[Sequence[float | None]]
+    shares: Sequence[Sequence[tuple[float, Interval] | None]]
 
 
 def drawn(panel: Panel) -> list[Shown]:
@@ -46,7 +45,7 @@ def colours(entries: Sequence[Shown]) -> dict[str, str]:
     for one in entries:
         reference = one.kind == "reference"
         many = sum(("reference" in colour) == reference for colour in found.values())
-        found[one.name] = f"c{many}" if not reference else "reference dotted" if many else "reference"
+        found[one.name] = f"reference r{many % 4}" if reference else f"c{many}"
     return found
 
 
@@ -57,8 +56,8 @@ def overview(panels: Sequence[Panel], specs: Sequence[TaskSpec]) -> dict[str, An
     colour = colours(entries)
     return {
         "colour": colour,
-        "profiles": {panel.split: _profile(entries, panel.split, specs, colour) for panel in main},
-        "better": {panel.split: _better(entries, panel.split, specs) for panel in main},
+        "profiles": {panel.split: _profile(_lines(panel, colour), colour) for panel in main},
+        "better": {panel.split: _better(_lines(panel, colour)) for panel in main},
         "lines": {panel.split: [*panel.verified, *panel.reported] for panel in main},
         "cards": [(spec, _best_film(main[0], spec)) for spec in specs] if main else [],
     }
@@ -102,53 +101,28 @@ def agent(one: Shown, specs: Sequence[TaskSpec]) -> dict[str, Any]:
     }
 
 
-def _runs(one: Shown, split: str, specs: Sequence[TaskSpec]) -> dict[str, list[float]]:
-    """Scores of every trained policy, by task."""
-    found = {spec.task: one.task(split, spec.task) for spec in specs}
-    return {
-        name: [run["score"] for run in numbers["runs"] if run["score"] is not None]
-        for name, numbers in found.items()
-        if numbers is not None
-    }
+def _lines(panel: Panel, colour: Mapping[str, str]) -> list[Line]:
+    """The lines of a table that charts show."""
+    return [line for line in (*panel.verified, *panel.reported) if line.shown.name in colour]
 
 
-def _profile(
-    entries: Sequence[Shown], split: str, specs: Sequence[TaskSpec], colour: Mapping[str, str]
-) -> Chart | None:
-    """Share of (task, trained policy) that reach a score, over the score."""
+def _profile(lines: Sequence[Line], colour: Mapping[str, str]) -> Chart | None:
+    """Share of (task, trained policy) whose score is above a threshold, over the threshold."""
     series: list[Series] = []
-    for one in entries:
-        runs = [score for scores in _runs(one, split, specs).values() for score in scores]
-        if runs:
-            shares = [(float(at), float(np.mean(np.array(runs) > at))) for at in _PROFILE]
-            series.append(Series(one.name, colour[one.name], shares, stairs=True))
+    for line in lines:
+        profile = line.result["aggregate"]["profile"]
+        points = list(zip(profile["thresholds"], profile["share"], strict=True))
+        series.append(Series(line.shown.name, colour[line.shown.name], points))
     return chart(
-        series,
-        x_label="score",
-        y_label="share of tasks above it",
-        x_limits=(-0.25, 1.25),
-        y_limits=(0.0, 1.02),
-        legend=True,
-    )
+        series, x_label="score", y_label="share above it", x_limits=CLIP, y_limits=(0.0, 1.02), legend=True
+    )  # fmt: skip
 
 
-def _better(entries: Sequence[Shown], split: str, specs: Sequence[TaskSpec]) -> Better:
-    runs = {one.name: _runs(one, split, specs) for one in entries if one.result(split)}
+def _better(lines: Sequence[Line]) -> Better:
     return Better(
-        list(runs),
-        [[None if a == b else _chance(runs[a], runs[b]) for b in runs] for a in runs],
+        [line.shown.name for line in lines],
+        [[None if a is b else better(a.result, b.result) for b in lines] for a in lines],
     )
-
-
-def _chance(a: Mapping[str, Sequence[float]], b: Mapping[str, Sequence[float]]) -> float | None:
-    """P(improvement): mean over common tasks of the share of pairs in which the first is better."""
-    common = [task for task in a if task in b]
-    shares = [
-        np.mean([(x > y) + 0.5 * (x == y) for x in a[task] for y in b[task]])
-        for task in common
-        if a[task] and b[task]
-    ]
-    return float(np.mean(shares)) if shares else None
 
 
 def _best_film(panel: Panel, spec: TaskSpec) -> tuple[Shown, Line] | None:

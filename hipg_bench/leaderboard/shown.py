@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hipg_bench.errors import BoardError
+from hipg_bench.evaluation.ranking import Kind, kind_of
 from hipg_bench.evaluation.splits import SPLITS
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Entry, Status, read_entry
@@ -54,12 +55,9 @@ class Shown:
         return "hidden" if self.status == "verified" else "public"
 
     @property
-    def kind(self) -> Literal["reference", "method", "checkpoint"]:
-        """What it is: see `hipg_bench.evaluation.ranking`."""
-        if self.card.kind == "builtin":
-            return "reference"
-        seeds = [len(seeds) for seeds in self.entry.policies.values()]
-        return "method" if min(seeds, default=0) >= 5 else "checkpoint"
+    def kind(self) -> Kind:
+        """What it is, for its rank."""
+        return kind_of(self.card.kind == "builtin", [len(seeds) for seeds in self.entry.policies.values()])
 
     def result(self, split: str) -> Mapping[str, Any] | None:
         """Results on a split in the worlds that count; None if it was not played."""

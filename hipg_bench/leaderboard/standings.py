@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from hipg_bench import registry
 from hipg_bench.evaluation import splits
+from hipg_bench.evaluation.ranking import rank
 from hipg_bench.evaluation.results import aggregate
 from hipg_bench.leaderboard.shown import Shown
 from hipg_bench.spec import TaskSpec
@@ -24,27 +24,46 @@ class Line:
 
     Attributes:
         shown: whose.
+        result: its results on the split, with the table's tasks only.
         rank: from 1; None for references.
-        score, ci95: interquartile mean over the tasks, and its interval.
         survival: share of agents alive at the end, mean over tasks.
         deaths: per episode, mean over tasks.
-        played, tasks: tasks that were played, and that there are.
-        dnf: tasks in which too many episodes failed.
-        failed: episodes that failed.
-        public: the score on public worlds, where ``score`` is of hidden ones.
+        tasks: how many there are.
+        public: the score on public worlds, where that of hidden ones counts and the table has all families.
     """
 
     shown: Shown
+    result: Mapping[str, Any]
     rank: int | None
-    score: float
-    ci95: tuple[float, float]
     survival: float | None
     deaths: float | None
-    played: int
     tasks: int
-    dnf: int
-    failed: int
     public: float | None
+
+    @property
+    def score(self) -> float:
+        """Interquartile mean over the tasks; unplayed ones count as 0."""
+        return self.result["aggregate"]["score_iqm"]
+
+    @property
+    def ci95(self) -> Sequence[float]:
+        """Its 95 % interval."""
+        return self.result["aggregate"]["score_iqm_ci95"]
+
+    @property
+    def played(self) -> int:
+        """Tasks that were played."""
+        return len(self.result["tasks"])
+
+    @property
+    def dnf(self) -> int:
+        """Tasks in which too many episodes failed."""
+        return sum(task["dnf"] for task in self.result["tasks"])
+
+    @property
+    def failed(self) -> int:
+        """Episodes that failed."""
+        return sum(sum(task["failures"].values()) for task in self.result["tasks"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +88,7 @@ def panels(entries: Sequence[Shown], specs: Sequence[TaskSpec]) -> list[Panel]:
 
 
 def _panel(entries: Sequence[Shown], specs: Sequence[TaskSpec], split: str, family: str) -> Panel:
-    chosen = [spec for spec in specs if family in (ALL, spec.family)]
+    chosen = [splits.with_anchors(split, spec) for spec in specs if family in (ALL, spec.family)]
     there = [one for one in entries if _scored(one, split)]
     return Panel(
         split,
@@ -87,50 +106,32 @@ def _scored(one: Shown, split: str) -> bool:
 
 def _line(one: Shown, specs: Sequence[TaskSpec], split: str) -> Line:
     names = [spec.task for spec in specs]
-    result = one.result(split) or {}
+    result = dict(one.result(split) or {})
     tasks = [task for task in result["tasks"] if task["task"] in names]
-    whole = score_of(one, tuple(names), split, one.worlds)
-    public = (
-        score_of(one, tuple(names), split, "public")[0]
-        if one.worlds == "hidden" and ("public", split) in one.results
-        else None
-    )
+    whole = result["aggregate"]["scored"] == [spec.task for spec in specs if spec.anchors]
+    if not whole:
+        played = {task["task"] for task in tasks}
+        rows = [
+            (spec, one.rows(one.worlds, split, spec.task) if spec.task in played else []) for spec in specs
+        ]
+        result |= {"tasks": tasks, "aggregate": aggregate(rows), "kind": one.kind}
+    public = one.results.get(("public", split)) if one.worlds == "hidden" and whole else None
     return Line(
         shown=one,
+        result=result,
         rank=None,
-        score=whole[0],
-        ci95=whole[1],
         survival=_mean([task["survival"] for task in tasks]),
         deaths=_mean([task["deaths"] for task in tasks]),
-        played=len(tasks),
         tasks=len(names),
-        dnf=sum(task["dnf"] for task in tasks),
-        failed=sum(sum(task["failures"].values()) for task in tasks),
-        public=public,
+        public=public["aggregate"]["score_iqm"] if public else None,
     )
 
 
 def _ranked(lines: Sequence[Line]) -> list[Line]:
-    """Best first; references stand among the others and have no rank."""
-    ordered = sorted(lines, key=lambda line: (-line.score, line.shown.name))
-    ranks = iter(range(1, len(ordered) + 1))
-    return [
-        line if line.shown.kind == "reference" else dataclasses.replace(line, rank=next(ranks))
-        for line in ordered
-    ]
-
-
-def score_of(
-    one: Shown, tasks: tuple[str, ...], split: str, worlds: Any
-) -> tuple[float, tuple[float, float]]:
-    """Interquartile mean of an entry's scores over tasks, with a 95 % interval; unplayed tasks count as 0."""
-    specs = [splits.with_anchors(split, registry.task_spec(task)) for task in tasks]
-    played = {task["task"] for task in one.results[worlds, split]["tasks"]}
-    found = aggregate(
-        [(spec, one.rows(worlds, split, spec.task) if spec.task in played else []) for spec in specs]
-    )
-    low, high = found["score_iqm_ci95"]
-    return found["score_iqm"], (low, high)
+    """In the order of the protocol: methods, checkpoints, references."""
+    named = {line.shown.name: line for line in lines}
+    standings = rank({name: line.result for name, line in named.items()})
+    return [dataclasses.replace(named[one.name], rank=one.place) for one in standings]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

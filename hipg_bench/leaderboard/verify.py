@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hipg_bench.errors import BoardError
-from hipg_bench.evaluation import decentralised
+from hipg_bench.evaluation import decentralised, protocol
 from hipg_bench.evaluation.episodes import versions
-from hipg_bench.evaluation.seeds import commitment
+from hipg_bench.evaluation.seeds import SUITE, commitment
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
 from hipg_bench.leaderboard.playing import Match, Progress, keep, play, quiet
@@ -53,9 +53,13 @@ def verify(
         progress: told how far it is.
 
     Raises:
-        BoardError: the salt is not the promised one, or the entry is damaged or changed meanwhile.
+        BoardError: the tree is not the frozen suite, the salt not the promised one, or the entry is damaged
+            or changed meanwhile.
         UnknownNameError: no such entry.
     """
+    changed = protocol.differences()
+    if changed:
+        raise BoardError(f"the tree is not {SUITE}, so nothing is verified with it: {changed[0]}")
     promised = read_commitments(board.root).sha256
     if commitment(salt) != promised:
         raise BoardError(f"this salt is not the one that {board.root} is bound to")
