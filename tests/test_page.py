@@ -260,7 +260,8 @@ def test_what_a_submitter_wrote_is_text(visit, site):
         assert page.locator("body").is_visible()
         assert page.evaluate("window.pwned") is None
         for link in page.locator("a").evaluate_all("links => links.map(link => [link.href, link.rel])"):
-            assert link[0].startswith((site.as_uri(), "https://example.org/%22onmouseover="))
+            outside = ("https://example.org/%22onmouseover=", "https://github.com/instadeepai/marl-eval")
+            assert link[0].startswith((site.as_uri(), *outside))
             assert link[0].startswith("file:") or "noopener" in link[1]
     page = visit("agents/hostile.html")
     assert page.locator(".lead").inner_text() == EVIL[:300]
@@ -330,6 +331,32 @@ def test_the_same_board_is_the_same_site(board, site, tmp_path):
     )
     assert first == second
     assert list(tmp_path.iterdir()) == [tmp_path / "site"]
+
+
+def test_the_data_for_programs_are_the_rows(board, site):
+    entries = {one.name: one for one in read_board(board)}
+    found = json.loads((site / "data" / "marl_eval_standard.json").read_text())["hipg_bench"][TASK]
+    assert set(found) == set(entries)
+    for name, worlds in (("newcomer", "hidden"), ("zero", "public")):
+        values = found[name]["seed_0"]["absolute_metrics"]["return"]
+        assert values == [row["return"] for row in entries[name].rows(worlds, "standard", TASK)]
+    lines = json.loads((site / "data" / "board.json").read_text())
+    (line,) = (
+        one for one in lines if (one["split"], one["family"], one["name"]) == ("standard", "all", "steady")
+    )
+    assert (line["kind"], line["worlds"], line["rank"], line["tasks_played"]) == ("method", "public", 1, 1)
+
+
+def test_a_film_is_kept_while_its_episodes_are_the_same(board, tmp_path):
+    shutil.copytree(board.root, tmp_path / "board")
+    again = Board(tmp_path / "board")
+    (again.folder("zero") / "films").mkdir()
+    (again.folder("zero") / "films" / f"{TASK}.mp4").write_bytes(b"a film")
+    add(again, "zero", MATCH, replace=True)
+    assert (again.folder("zero") / "films" / f"{TASK}.mp4").read_bytes() == b"a film"
+    # other worlds: it is not theirs
+    add(again, "zero", Match((TASK,), ("standard",), episodes=4, threads=1), replace=True)
+    assert not (again.folder("zero") / "films").exists()
 
 
 def test_a_folder_with_something_else_is_not_replaced(board, tmp_path):

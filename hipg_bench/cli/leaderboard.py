@@ -6,7 +6,7 @@ import contextlib
 import functools
 import http.server
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,8 +63,7 @@ def add(
             Board(board), source, match, claims=claims, replace=replace,
             film_tasks=_filmed(films, match), progress=progress,
         )  # fmt: skip
-    for trouble in added.trouble:
-        console.err.print(f"no film: {trouble}", markup=False)
+    _tell_trouble(added.trouble)
     entry = added.entry
     console.say(
         f"[bold]{entry.name}[/bold] is on the board, {entry.status(None)}: "
@@ -150,7 +149,7 @@ def refresh(
     for name in agents():
         with _telling() as progress:
             with opened(name) as source:
-                adding.add(
+                added = adding.add(
                     Board(board),
                     source,
                     match,
@@ -163,6 +162,7 @@ def refresh(
                 if salt
                 else None
             )
+        _tell_trouble(added.trouble)
         if found:
             _report(name, found)
         else:
@@ -232,6 +232,11 @@ def _telling() -> Generator[Callable[[str, float, float], None]]:
             bars.advance(bars.task_ids[ids[stage]], done)
 
         yield tell
+
+
+def _tell_trouble(trouble: Sequence[str]) -> None:
+    for line in trouble:
+        console.err.print(f"no film: {line}", markup=False)
 
 
 def _report(name: str, found: Verification) -> None:

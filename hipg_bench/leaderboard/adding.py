@@ -10,7 +10,7 @@ import csv
 import dataclasses
 import math
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hipg_bench.errors import BoardError
@@ -20,7 +20,7 @@ from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Entry, now
 from hipg_bench.leaderboard.playing import Match, Progress, keep, play, played_tasks, quiet
 from hipg_bench.leaderboard.rows import parse_rows
-from hipg_bench.leaderboard.shown import run_path
+from hipg_bench.leaderboard.shown import rows_path, run_path
 from hipg_bench.leaderboard.source import BUNDLE, Source
 from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
@@ -78,6 +78,7 @@ def add(
             run = play(agent, match, split, work, progress=progress)
             hashes |= keep(run, folder, "public", split)
         _copy_curves(agent, folder)
+        _keep_films(board, earlier, hashes, folder)
         trouble = films.make(agent, match, film_tasks, work, folder, progress)
         policies = {task: agent.train_seeds(task) for task in played_tasks(work / match.splits[0])}
         privileged = any(
@@ -112,6 +113,16 @@ def _copy_card(source: Source, folder: Path) -> None:
         shutil.copyfile(readme, folder / "README.md")
     if source.bundle is not None:
         shutil.copyfile(source.bundle, folder / BUNDLE)
+
+
+def _keep_films(board: Board, earlier: Entry | None, hashes: Mapping[str, str], folder: Path) -> None:
+    """Take over the films of an entry that is replaced, where the episodes are the same."""
+    if earlier is not None:
+        for film in sorted((board.folder(earlier.name) / "films").glob("*.mp4")):
+            path = rows_path("public", "standard", film.stem)
+            if hashes.get(path) is not None and hashes[path] == earlier.rows.get(path):
+                (folder / "films").mkdir(exist_ok=True)
+                shutil.copyfile(film, folder / "films" / film.name)
 
 
 def _bring(claims: Path, split: str, work: Path) -> bool:

@@ -38,13 +38,13 @@ _SMALL = (
 def make(
     agent: Agent, match: Match, tasks: Sequence[str], work: Path, folder: Path, progress: Progress
 ) -> list[str]:
-    """Film an agent in tasks that it plays; return what went wrong."""
+    """Film an agent in tasks that it plays and has no film of; return what went wrong."""
     plan = match.plan("standard")
     trouble: list[str] = []
     for task in tasks:
         rows = work / "standard" / "episodes" / f"{task}.jsonl"
         row = _row(rows) if rows.is_file() else None
-        if row is not None:
+        if row is not None and not (folder / "films" / f"{task}.mp4").exists():
             try:
                 _film(agent, task, row, plan, folder / "films" / f"{task}.mp4")
             except HipgError as error:

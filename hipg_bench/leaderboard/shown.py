@@ -83,8 +83,8 @@ class Shown:
         """Task to film."""
         return {path.stem: path for path in sorted(self.folder.glob("films/*.mp4"))}
 
-    def rows(self, worlds: Worlds, split: str, task: str) -> list[dict[str, Any]]:
-        """The raw rows.
+    def text(self, worlds: Worlds, split: str, task: str) -> bytes:
+        """The raw rows, a line each.
 
         Raises:
             BoardError: they are damaged, or not those that were entered.
@@ -95,7 +95,11 @@ class Shown:
             raise BoardError(
                 f"{self.folder / path} is not what was entered: its hash differs from entry.json's"
             )
-        return parse_rows(text, str(self.folder / path))
+        return text
+
+    def rows(self, worlds: Worlds, split: str, task: str) -> list[dict[str, Any]]:
+        """The same, parsed."""
+        return parse_rows(self.text(worlds, split, task), f"{self.name}: {split}/{task}")
 
 
 def run_path(worlds: Worlds, split: str) -> str:

@@ -26,7 +26,7 @@ import markupsafe
 
 from hipg_bench import registry
 from hipg_bench.errors import BoardError
-from hipg_bench.evaluation import splits
+from hipg_bench.evaluation import export, splits
 from hipg_bench.leaderboard import pictures, standings
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.salt import Commitments, read_commitments
@@ -60,6 +60,11 @@ class View:
     specs: Sequence[TaskSpec]
     panels: Sequence[standings.Panel]
     commitments: Commitments
+
+    @property
+    def played(self) -> list[str]:
+        """The splits that there are tables of."""
+        return list(dict.fromkeys(panel.split for panel in self.panels))
 
     @property
     def drawn(self) -> list[Shown]:
@@ -188,3 +193,23 @@ def _data(view: View, out: Path) -> None:
     ]  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     (out / "board.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    for split in view.played:
+        document = json.dumps(_marl_eval(view.entries, split)) + "\n"
+        (out / f"marl_eval_{split}.json").write_text(document, encoding="utf-8")
+
+
+def _marl_eval(entries: Sequence[Shown], split: str) -> export.Document:
+    """A split's episodes in marl-eval's form, of each entry in the worlds that count."""
+    with tempfile.TemporaryDirectory(prefix="hipg-export-") as place:
+        folders: list[Path] = []
+        for one in entries:
+            result = one.result(split)
+            if result is not None:
+                folder = Path(place) / one.name
+                (folder / "episodes").mkdir(parents=True)
+                (folder / "results.json").write_text(json.dumps(result), encoding="utf-8")
+                for task in result["tasks"]:
+                    rows = one.text(one.worlds, split, task["task"])
+                    (folder / "episodes" / f"{task['task']}.jsonl").write_bytes(rows)
+                folders.append(folder)
+        return export.marl_eval(folders)
