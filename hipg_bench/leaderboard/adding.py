@@ -28,7 +28,7 @@ from hipg_bench.registry import task_spec
 
 CURVE_POINTS = 300
 """Kept of a learning curve."""
-_MOST_CURVE_BYTES = 8 * 2**20
+_MOST_CURVE_BYTES, _MOST_CLAIMED_BYTES = 8_000_000, 64_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,6 +129,8 @@ def _bring(claims: Path, split: str, work: Path) -> bool:
     """Lay claimed rows where the evaluation goes on from them; say whether there are any."""
     found = sorted((claims / split / "episodes").glob("*.jsonl"))
     for path in found:
+        if path.stat().st_size > _MOST_CLAIMED_BYTES:
+            raise BoardError(f"{path}: at most {_MOST_CLAIMED_BYTES} bytes of rows are allowed")
         text = path.read_bytes()
         for row in parse_rows(text, path.name):
             _check(row, path.name)

@@ -20,7 +20,7 @@ from hipg_bench.rendering import film
 
 WORLD = 2
 """The public world that everybody is filmed in: fixed beforehand, so nobody's best episode is chosen."""
-_SIZE, _FPS = (640, 360), 20
+_SIZE, _FPS = (640, 360), 15
 _SMALL = (
     "-c:v",
     "libx264",

@@ -112,7 +112,7 @@ def _profile(lines: Sequence[Line], colour: Mapping[str, str]) -> Chart | None:
     for line in lines:
         profile = line.result["aggregate"]["profile"]
         points = list(zip(profile["thresholds"], profile["share"], strict=True))
-        series.append(Series(line.shown.name, colour[line.shown.name], points))
+        series.append(Series(line.shown.name, colour[line.shown.name], points, stairs=True))
     return chart(
         series, x_label="score", y_label="share above it", x_limits=CLIP, y_limits=(0.0, 1.02), legend=True
     )  # fmt: skip

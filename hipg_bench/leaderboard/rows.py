@@ -16,8 +16,8 @@ from hipg_bench.paths import replacing
 Key = tuple[int, int]
 """A row's training seed and world."""
 
-_SHOWN = 60
-"""Characters of a value that are kept in a difference."""
+_SHOWN, _MOST_FIELDS = 60, 12
+"""Characters of a value, and fields of a row, that are kept in a difference."""
 
 
 def pack(text: bytes, path: Path) -> str:
@@ -86,11 +86,19 @@ def _say(claimed: bytes | None, got: bytes | None) -> Mapping[str, Any]:
     if claimed is None or got is None:
         return {"what": "not claimed" if claimed is None else "claimed, but there is no such world"}
     a, b = json.loads(claimed), json.loads(got)
-    fields = {name: (a.get(name), b.get(name)) for name in {*a, *b} if a.get(name) != b.get(name)}
-    said = (f"{name}: claimed {_short(x)}, got {_short(y)}" for name, (x, y) in sorted(fields.items()))
-    return {"fields": fields, "what": "; ".join(said) or "the same numbers, written otherwise"}
+    names = [name for name in sorted({*a, *b}) if a.get(name) != b.get(name)][:_MOST_FIELDS]
+    said = (f"{_short(name)}: claimed {_short(a.get(name))}, got {_short(b.get(name))}" for name in names)
+    return {
+        "fields": {_short(name): (_plain(a.get(name)), _plain(b.get(name))) for name in names},
+        "what": "; ".join(said) or "the same numbers, written otherwise",
+    }
+
+
+def _plain(value: object) -> object:
+    """A number as it is, anything else as short text: a claim may hold anything."""
+    return value if value is None or isinstance(value, (int, float)) else _short(value)
 
 
 def _short(value: object) -> str:
-    text = repr(value)
+    text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
