@@ -249,5 +249,5 @@ def test_all_splits_come_to_lie_side_by_side_and_are_exported(tmp_path):
     assert set(json.loads((tmp_path / "out.json").read_text())) == {
         "hipg_bench", "hipg_bench_ad_hoc", "hipg_bench_forced_death", "hipg_bench_shift",
     }  # fmt: skip
-    done = run("evaluate", "--agent", "random", "--split", "shif", "--out", tmp_path / "no")
-    assert (done.returncode, "did you mean 'shift'?" in done.stderr) == (2, True)
+    done = run("evaluate", "--agent", "random", "--split", "ad_hok", "--out", tmp_path / "no")
+    assert (done.returncode, "did you mean 'ad_hoc'?" in done.stderr) == (2, True)

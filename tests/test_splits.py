@@ -207,8 +207,8 @@ def test_anchors_are_only_for_the_task_as_it_is():
 
 
 def test_what_a_split_cannot_do_is_said():
-    with pytest.raises(UnknownNameError, match="did you mean 'shift'"):
-        Plan(split="shif").play_all(NAV, Random(3))
+    with pytest.raises(UnknownNameError, match="did you mean 'ad_hoc'"):
+        Plan(split="ad_hok").play_all(NAV, Random(3))
     with pytest.raises(UnknownNameError, match="paper_nav-4: shift has no rules for its family"):
         Plan(split="shift").play_all(task_spec("paper_nav-4"), Random(2))
     with pytest.raises(BundleError, match="made for other bodies"):

@@ -83,7 +83,7 @@ def test_intervals_move_with_the_scale(runs, shift, factor):
     assert min(map(min, runs)) - 1e-9 <= low <= high <= max(map(max, runs)) + 1e-9
 
 
-RLIABLE = json.loads((Path(__file__).parent / "golden" / "rliable.json").read_text())
+RLIABLE = json.loads((Path(__file__).parent / "reference" / "rliable.json").read_text())
 
 
 def by_task(matrix):
@@ -92,7 +92,7 @@ def by_task(matrix):
 
 @pytest.mark.parametrize("case", RLIABLE["cases"])
 def test_points_and_intervals_are_those_of_rliable(case):
-    """`scripts/golden_rliable.py` made the numbers, with rliable 1.2.0 in an environment of its own."""
+    """`scripts/rliable_numbers.py` made the numbers, with rliable 1.2.0 in an environment of its own."""
     ours, theirs = by_task(case["ours"]), by_task(case["theirs"])
     for name, value in case["points"].items():
         statistic = getattr(statistics, name)

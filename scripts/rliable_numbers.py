@@ -1,10 +1,10 @@
-"""What rliable 1.2.0 makes of fixed matrices: the numbers of ``tests/golden/rliable.json``.
+"""What rliable 1.2.0 makes of fixed matrices: the numbers of ``tests/reference/rliable.json``.
 
 It needs an environment of its own, as it does not start beside today's pandas and arch:
 
     python3 -m venv .venv-rliable
     .venv-rliable/bin/pip install rliable==1.2.0 'pandas<3' 'arch<8' 'numpy<2'
-    .venv-rliable/bin/python scripts/golden_rliable.py tests/golden/rliable.json
+    .venv-rliable/bin/python scripts/rliable_numbers.py tests/reference/rliable.json
 """
 
 import json
