@@ -51,7 +51,7 @@ class Worlds:
             spec: the task.
             setting: what the split does.
             seed: evaluation seed.
-            block: the how-manieth evaluation seed it is.
+            block: which evaluation seed of the task it is, from 0.
             ids: (B,) episodes.
             threads: physics threads, 0 for all cores.
         """
