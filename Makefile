@@ -2,7 +2,7 @@
 #   make evaluate AGENT=random ARGS="--quick"
 #   make test ARGS="-k laws"
 .DEFAULT_GOAL := help
-.PHONY: help setup evaluate test test-rllib test-benchmarl lint format bench bench-peers golden clean
+.PHONY: help setup evaluate test test-long test-rllib test-benchmarl lint format bench bench-peers golden freeze clean
 
 BIN := .venv/bin
 READY := .venv/.ready
@@ -45,6 +45,13 @@ bench: $(READY) ## speed and memory, beside what bounds them; ARGS="--full --plo
 
 bench-peers: $(READY) ## our speed beside VMAS, JaxMARL, PettingZoo, MaMuJoCo and TorchRL, in .venv-peers
 	scripts/bench_peers.sh $(ARGS)
+
+test-long: $(READY) ## what takes long: evaluations killed twenty times, whole suites twice
+	$(BIN)/pytest -m long $(ARGS)
+
+freeze: $(READY) ## after a wanted change: the golden episodes must hold, then the suite version is frozen anew
+	$(BIN)/pytest tests/test_golden.py
+	$(BIN)/hipg-bench suite freeze
 
 golden: $(READY) ## record the golden episodes anew, after a wanted change of behaviour
 	$(BIN)/pytest tests/test_golden.py --record-golden
