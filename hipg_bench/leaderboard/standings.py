@@ -108,8 +108,9 @@ def _line(one: Shown, specs: Sequence[TaskSpec], split: str) -> Line:
     names = [spec.task for spec in specs]
     result = dict(one.result(split) or {})
     tasks = [task for task in result["tasks"] if task["task"] in names]
-    whole = result["aggregate"]["scored"] == [spec.task for spec in specs if spec.anchors]
-    if not whole:
+    anchored = [spec.task for spec in specs if spec.anchors]
+    whole = sorted(result["aggregate"]["scored"]) == sorted(anchored)
+    if result["aggregate"]["scored"] != anchored:
         played = {task["task"] for task in tasks}
         rows = [
             (spec, one.rows(one.worlds, split, spec.task) if spec.task in played else []) for spec in specs

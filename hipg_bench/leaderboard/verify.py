@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from hipg_bench import registry
 from hipg_bench.errors import BoardError
 from hipg_bench.evaluation import decentralised, protocol
 from hipg_bench.evaluation.episodes import versions
@@ -24,7 +25,6 @@ from hipg_bench.leaderboard.salt import read_commitments
 from hipg_bench.leaderboard.shown import Shown, read_shown, rows_path
 from hipg_bench.leaderboard.source import Source, reopened
 from hipg_bench.policies.bundle import Agent
-from hipg_bench.registry import task_spec
 from hipg_bench.sandbox import choice
 
 _KEPT = 20
@@ -100,7 +100,7 @@ def _matches(shown: Shown, threads: int) -> dict[str, Match]:
     """What was played of each split when the entry was made."""
     return {
         split: Match(
-            tasks=tuple(one["task"] for one in (*result["tasks"], *result["skipped"])),
+            tasks=_in_order([one["task"] for one in (*result["tasks"], *result["skipped"])]),
             splits=(split,),
             episodes=result["episodes_per_policy"],
             threads=threads,
@@ -108,6 +108,11 @@ def _matches(shown: Shown, threads: int) -> dict[str, Match]:
         for (worlds, split), result in shown.results.items()
         if worlds == "public"
     }
+
+
+def _in_order(tasks: Sequence[str]) -> tuple[str, ...]:
+    """Tasks as the suite orders them."""
+    return tuple(task for task in registry.tasks() if task in tasks)
 
 
 def _compare(shown: Shown, agent: Agent, work: Path, threads: int, progress: Progress) -> _Comparison:
@@ -135,7 +140,9 @@ def _audit(agent: Agent, shown: Shown, salt: bytes) -> tuple[Execution, tuple[st
         return "decentralised", ()
     for task, seeds in shown.entry.policies.items():
         plan = Match(episodes=2, threads=1).plan("standard", salt)
-        verdict = decentralised.verify(task_spec(task), agent.policy(task_spec(task), min(seeds)), plan)
+        verdict = decentralised.verify(
+            registry.task_spec(task), agent.policy(registry.task_spec(task), min(seeds)), plan
+        )
         if not verdict.decentralised:
             return "centralised", (f"{task}: {verdict}",)
     return "decentralised", ()
