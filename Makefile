@@ -2,7 +2,7 @@
 #   make evaluate AGENT=random ARGS="--quick"
 #   make test ARGS="-k laws"
 .DEFAULT_GOAL := help
-.PHONY: help setup evaluate test test-long test-rllib test-benchmarl lint format bench bench-peers golden freeze clean
+.PHONY: help setup evaluate test test-long test-rllib test-benchmarl lint format leaderboard bench bench-peers golden freeze clean
 
 BIN := .venv/bin
 READY := .venv/.ready
@@ -39,6 +39,9 @@ lint: $(READY) ## style, types, layers, spelling
 format: $(READY) ## mend style where a tool can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+leaderboard: $(READY) ## write the page of leaderboard/ to site/
+	$(BIN)/hipg-bench leaderboard build --out site $(ARGS)
 
 bench: $(READY) ## speed and memory, beside what bounds them; ARGS="--full --plot speed.png" for all of it
 	$(BIN)/hipg-bench bench $(ARGS)
