@@ -138,13 +138,13 @@ def _audit(agent: Agent, shown: Shown, salt: bytes) -> tuple[Execution, tuple[st
         return "centralised", ()
     if agent.card.tier != 2:
         return "decentralised", ()
+    plan = Match(episodes=2, threads=1).plan("standard", salt)
     for task, seeds in shown.entry.policies.items():
-        plan = Match(episodes=2, threads=1).plan("standard", salt)
-        verdict = decentralised.verify(
-            registry.task_spec(task), agent.policy(registry.task_spec(task), min(seeds)), plan
-        )
-        if not verdict.decentralised:
-            return "centralised", (f"{task}: {verdict}",)
+        spec = registry.task_spec(task)
+        for seed in seeds:
+            verdict = decentralised.verify(spec, agent.policy(spec, seed), plan)
+            if not verdict.decentralised:
+                return "centralised", (f"{task}, training seed {seed}: {verdict}",)
     return "decentralised", ()
 
 

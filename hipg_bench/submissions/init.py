@@ -9,8 +9,9 @@ import jinja2
 
 from hipg_bench import registry
 from hipg_bench.errors import BundleError
+from hipg_bench.evaluation.seeds import SUITE
 from hipg_bench.paths import write_text
-from hipg_bench.submissions.paperwork import SUITE, SUITE_TAG, TODO
+from hipg_bench.submissions.paperwork import SUITE_TAG, TODO
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]{0,63}")

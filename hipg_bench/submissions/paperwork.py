@@ -10,17 +10,17 @@ from pathlib import Path, PurePosixPath
 
 from hipg_bench import registry
 from hipg_bench.errors import BundleError, hint
+from hipg_bench.evaluation.seeds import SUITE
+from hipg_bench.evaluation.statistics import METHOD_RUNS
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.policies.card import Card
 from hipg_bench.submissions.archive import check_name, check_sizes
 from hipg_bench.submissions.findings import Finding, advice, error, fine
 
-SUITE, SUITE_TAG = "hipg-1", "standard"
-"""What is submitted to, and the tag of its tasks."""
+SUITE_TAG = "standard"
+"""Tag of the tasks of the suite that is submitted to."""
 TODO = "TODO"
 """What the templates of `init` leave to be filled in."""
-SEEDS_OF_A_METHOD = 5
-"""Separately trained policies per task; fewer make a checkpoint, which is never ranked above a method."""
 _LICENSES = "MIT, Apache-2.0, BSD-3-Clause, GPL-3.0-only, CC-BY-4.0, CC0-1.0"
 _WEIGHTS = {".safetensors": "network", ".onnx": "onnx"}
 _PLACE = re.compile(r"[^/]+/seed\d+(\.safetensors|\.onnx|\.json|\.curve\.csv)")
@@ -174,10 +174,10 @@ def look_at_tasks(agent: Agent) -> Iterator[Finding]:
             f"train on them too, and add such as {lies}",
         )  # fmt: skip
     fewest = min(len(seeds[task]) for task in played)
-    if fewest < SEEDS_OF_A_METHOD:
+    if fewest < METHOD_RUNS:
         yield advice(
             "tasks", f"{fewest} trained seed{'s' * (fewest > 1)} per task: it is shown as a checkpoint",
-            f"train {SEEDS_OF_A_METHOD} or more from the start with other seeds to be ranked as a method",
+            f"train {METHOD_RUNS} or more from the start with other seeds to be ranked as a method",
         )  # fmt: skip
     listed = ", ".join(f"{task} ({len(seeds[task])})" for task in played)
     yield fine("tasks", f"plays {len(played)} of {len(suite)} tasks (trained seeds): {listed}")
