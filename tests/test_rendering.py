@@ -140,7 +140,9 @@ def test_a_killed_recording_leaves_nothing_behind(navigation, tmp_path, how):
     np.save(tmp_path / "rows.npy", rows)
     out = tmp_path / "films" / "a.mp4"
     code = (
-        "import sys, numpy as np; from pathlib import Path; from hipg_bench.rendering import film\n"
+        "import signal, sys, numpy as np; from pathlib import Path; from hipg_bench.rendering import film\n"
+        # where these tests run in the background, they and their children ignore Ctrl-C
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "film.record('hazard_nav-4', np.load(sys.argv[1]), Path(sys.argv[2]), agent='a', size=(640, 360), "
         "fps=120)"
     )
