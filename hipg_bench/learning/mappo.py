@@ -226,7 +226,7 @@ class Trainer:
             divergence = 0.0
             parts = torch.randperm(len(weight)).chunk(settings.minibatches)
             for part in parts:
-                policy = self.actor.distribution(observation[part])
+                policy = self.actor.distribution(observation.index_select(0, part))
                 change = policy.log_prob(action[part]).sum(-1) - log_prob[part]
                 spread = policy.entropy().sum(-1).mean()
                 credited = weight[part]
@@ -267,7 +267,7 @@ class Trainer:
             parts = torch.randperm(len(aim)).chunk(settings.minibatches)
             error = 0.0
             for part in parts:
-                value = self.critic.normalized(inputs[part])
+                value = self.critic.normalized(inputs.index_select(0, part))
                 loss = value_loss(value, before[part], aim[part], reach)
                 _descend(self.critic_optimizer, loss, settings.max_grad_norm)
                 error += float((value.detach() - aim[part]).square().mean()) / len(parts)

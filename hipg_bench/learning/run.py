@@ -19,7 +19,7 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from hipg_bench.errors import HipgError
-from hipg_bench.learning import mappo, trial
+from hipg_bench.learning import arithmetic, mappo, trial
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
 from hipg_bench.paths import write_text
 from hipg_bench.policies.network import load_network
@@ -104,6 +104,7 @@ def train(
         BundleError: ``settings.start`` does not fit.
         HipgError: the learner is built on TorchRL, which is not installed.
     """
+    arithmetic.prepare()
     out.mkdir(parents=True, exist_ok=True)
     learner = new_learner(settings, out)
     checkpoint, curve, policy = out / "checkpoint.pt", out / "curve.csv", out / "policy.safetensors"
