@@ -32,7 +32,7 @@ class RunSettings(Params):
 
     task: str
     seed: int = pydantic.Field(default=0, ge=0, le=999)
-    steps: int = pydantic.Field(default=6_000_000, ge=1)
+    steps: int = pydantic.Field(default=3_000_000, ge=1)
     num_envs: int = pydantic.Field(default=256, ge=1, le=65536)
     rollout: int = pydantic.Field(default=50, ge=1, le=10_000)
     gamma: float = pydantic.Field(default=0.98, ge=0, le=1)
