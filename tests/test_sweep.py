@@ -3,18 +3,25 @@
 import itertools
 import json
 import os
+import subprocess
+import sys
+import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from typer.testing import CliRunner
 
+import hipg_bench
 from hipg_bench.cli import app
-from hipg_bench.errors import SpecError
+from hipg_bench.errors import ResumeError, SpecError
 from hipg_bench.learning import sweep
 from hipg_bench.learning.run import train
 from hipg_bench.registry import tagged
 
+ROOT = Path(hipg_bench.__file__).resolve().parents[1]
 SWEEP = """
 [[run]]
 tasks = ["coop_nav-3"]
@@ -22,6 +29,13 @@ arms = ["central", "local"]
 seeds = [0, 1]
 settings = { num_envs = 4, rollout = 5, steps = 40, actor_hidden = [8], critic_hidden = [8] }
 """
+
+
+def wait_until(happened: Callable[[], bool]) -> None:
+    until = time.monotonic() + 60
+    while not happened():
+        assert time.monotonic() < until, "too slow"
+        time.sleep(0.05)
 
 
 def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Path) -> None:
@@ -42,6 +56,31 @@ def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Pat
     train(runs[1].settings, tmp_path / "again", command="by hand")
     assert (tmp_path / "again" / "policy.safetensors").read_bytes() == (
         runs[1].out / "policy.safetensors"
+    ).read_bytes()
+
+
+def test_a_killed_sweep_leaves_nobody_training_and_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "sweep.toml").write_text(SWEEP.replace("steps = 40", "steps = 4000").replace("[0, 1]", "[0]"))
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", "from hipg_bench.cli import main; main()", "train", "--workers", "1"]
+    process = subprocess.Popen(
+        [*command, "--sweep", str(tmp_path / "sweep.toml"), "--out", str(out)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    runs = sweep.load(tmp_path / "sweep.toml", out)
+    wait_until(lambda: runs[0].done > 0)
+    with pytest.raises(ResumeError, match="another process is training here"):
+        train(runs[0].settings, runs[0].out, command="beside it")
+    process.kill()
+    process.wait()
+    lock = FileLock(runs[0].out / ".lock")
+    lock.acquire(timeout=60)  # the worker lets go
+    lock.release()
+    assert 0 < runs[0].done < 4000
+    train(runs[0].settings, runs[0].out, command="once more")
+    train(runs[0].settings, tmp_path / "whole", command="never killed")
+    assert (tmp_path / "whole" / "policy.safetensors").read_bytes() == (
+        runs[0].out / "policy.safetensors"
     ).read_bytes()
 
 

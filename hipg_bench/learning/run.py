@@ -16,9 +16,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import mujoco
 import torch
+from filelock import FileLock, Timeout
 from torch.utils.tensorboard import SummaryWriter
 
-from hipg_bench.errors import HipgError
+from hipg_bench.errors import HipgError, ResumeError
 from hipg_bench.learning import arithmetic, mappo, trial
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
 from hipg_bench.paths import write_text
@@ -100,12 +101,22 @@ def train(
         report: called after every iteration with its number and what was logged.
 
     Raises:
-        ResumeError: the folder holds a run with other settings.
+        ResumeError: the folder holds a run with other settings, or another process is training in it.
         BundleError: ``settings.start`` does not fit.
         HipgError: the learner is built on TorchRL, which is not installed.
     """
     arithmetic.prepare()
     out.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(out / ".lock").acquire(timeout=0):
+            _train_alone(settings, out, command, report)
+    except Timeout as error:
+        raise ResumeError(f"{out}: another process is training here") from error
+
+
+def _train_alone(
+    settings: AnySettings, out: Path, command: str, report: Callable[[int, Log], None] | None
+) -> None:
     learner = new_learner(settings, out)
     checkpoint, curve, policy = out / "checkpoint.pt", out / "curve.csv", out / "policy.safetensors"
     rows: list[dict[str, Any]] = []

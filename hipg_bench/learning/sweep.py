@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 import json
 import multiprocessing
+import os
 import tomllib
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -195,4 +196,11 @@ def _runs(group: Group, out: Path) -> Iterator[Run]:
 
 def _train(settings: AnySettings, out: Path, command: str) -> None:
     torch.set_num_threads(1)
-    train(settings, out, command=command)
+    train(settings, out, command=command, report=_stop_when_orphaned)
+
+
+def _stop_when_orphaned(iteration: int, log: dict[str, float]) -> None:
+    """End this worker where the sweep's own process was killed, which cannot say so any more."""
+    sweep = multiprocessing.parent_process()
+    if sweep is not None and not sweep.is_alive():
+        os._exit(1)  # an exception would end this run alone, and begin the next
