@@ -17,7 +17,7 @@ from hipg_bench.learning.mappo import Trainer, surrogate, value_loss
 from hipg_bench.learning.networks import RunningNorm, Tanh
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, paper, recommended
-from hipg_bench.policies.network import load_network, save_network
+from hipg_bench.policies.network import load_network
 
 SMALL = {
     "num_envs": 8, "rollout": 10, "steps": 8 * 10 * 4, "actor_hidden": (16,), "critic_hidden": (16,),
@@ -119,6 +119,7 @@ def test_min_health_baseline_is_unbiased() -> None:
     """Lemma 1: E[b(s without i) grad log pi] = 0, on states and actions of a real task."""
     torch.manual_seed(0)
     trainer = Trainer(recommended("hazard_nav-4", num_envs=64, rollout=20))
+    trainer.iterate()  # values away from zero: a bias would show
     data = trainer.roll_out()
     baseline = trainer._value_without_each(data).view_as(data.health)
     mean = trainer.actor(data.observation).mean
@@ -163,15 +164,44 @@ def test_running_norm_matches_all_data_at_once() -> None:
     assert norm.scale[2] == 1
 
 
-def test_numpy_policy_is_the_torch_actor(tmp_path: Path) -> None:
-    trainer = Trainer(recommended("hazard_nav-4", **SMALL))
+def test_running_norm_treats_slots_alike() -> None:
+    rng = np.random.default_rng(0)
+    parts = [rng.normal(np.arange(5), 3, (n, 5)).astype(np.float32) for n in (50, 300)]
+    norm = RunningNorm(5, shared=[np.array([[1, 2], [3, 4]])])  # two slots of two numbers
+    for part in parts:
+        norm.update(torch.from_numpy(part))
+    together = np.concatenate(parts)
+    for entry in (1, 2):
+        both = together[:, [entry, entry + 2]]
+        np.testing.assert_allclose(norm.offset.numpy()[[entry, entry + 2]], both.mean(), atol=1e-3)
+        np.testing.assert_allclose(norm.scale.numpy()[[entry, entry + 2]], both.std(), rtol=1e-3)
+    np.testing.assert_allclose(norm.offset[0], together[:, 0].mean(), atol=1e-3)
+
+
+@pytest.mark.parametrize("attends", [(), ("point", "neighbor"), ("neighbor",)])
+def test_numpy_policy_is_the_torch_actor(attends: tuple[str, ...], tmp_path: Path) -> None:
+    trainer = Trainer(recommended("hazard_nav-4", attends=attends, **SMALL))
     trainer.iterate()
-    save_network(trainer.actor.tensors(), tmp_path / "policy.safetensors")
+    trainer.save_policy(tmp_path / "policy.safetensors")
     policy = load_network(tmp_path / "policy.safetensors")
-    observation, alive = trainer.step.observation, trainer.step.info["alive"]
+    observation, alive = trainer.step.observation.copy(), trainer.step.info["alive"]
+    observation[0, 0, trainer.env.layout.observation.slices["neighbor_seen"]] = 0.0  # nobody is in sight
     action, _ = policy.act(observation, None, alive)
     expected = trainer.actor(torch.from_numpy(observation)).mean.detach().numpy().clip(-1, 1)
     np.testing.assert_allclose(action, expected, atol=2e-5)
+
+
+def test_the_order_of_an_attended_group_does_not_matter() -> None:
+    trainer = Trainer(recommended("hazard_nav-4", **SMALL))
+    trainer.iterate()
+    slices = trainer.env.layout.observation.slices
+    seen = torch.from_numpy(trainer.step.observation)
+    turned = seen.clone()
+    for name in ("point_position", "point_hazardous", "point_gap"):
+        slots = seen[..., slices[name]].unflatten(-1, (4, -1))
+        turned[..., slices[name]] = slots.flip(-2).flatten(-2)
+    assert not torch.equal(seen, turned)
+    torch.testing.assert_close(trainer.actor(turned).mean, trainer.actor(seen).mean, atol=1e-5, rtol=1e-4)
 
 
 def test_a_resumed_run_is_the_same_run(tmp_path: Path) -> None:

@@ -30,14 +30,15 @@ from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
 from hipg_bench.paths import replacing
-from hipg_bench.policies.form import Form
-from hipg_bench.policies.network import load_network, save_network
+from hipg_bench.policies.network import AttentionForm, Form, load_network, save_network
 from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
 """Bounds of the actor's learning rate."""
 _START_COUNTS = 20
 """Rollouts that the normalisation of a start weighs."""
+_PIECE = 4096
+"""Samples whose gradient is taken at once: what passes between layers stays in the processor's cache."""
 _LOSE_EVERY = 5
 """Steps between two chances of a spontaneous death; each costs another look at all worlds."""
 
@@ -224,19 +225,21 @@ class Trainer:
         divergence = entropy = 0.0
         for _ in range(settings.epochs):
             divergence = 0.0
-            parts = torch.randperm(len(weight)).chunk(settings.minibatches)
-            for part in parts:
-                policy = self.actor.distribution(observation.index_select(0, part))
-                change = policy.log_prob(action[part]).sum(-1) - log_prob[part]
-                spread = policy.entropy().sum(-1).mean()
+            for part in torch.randperm(len(weight)).chunk(settings.minibatches):
                 credited = weight[part]
                 if settings.psi_over == "minibatch":
                     credited = (credited - credited.mean()) / (credited.std() + 1e-8)
-                loss = -surrogate(change, credited, settings.clip) - settings.entropy * spread
-                _descend(self.actor_optimizer, loss, settings.max_grad_norm)
-                # k3 estimator of KL(old, new): unbiased and never negative
-                divergence += float((change.exp() - 1 - change).mean().detach()) / len(parts)
-                entropy = float(spread.detach())
+                self.actor_optimizer.zero_grad()
+                for piece, psi_of in zip(part.split(_PIECE), credited.split(_PIECE), strict=True):
+                    policy = self.actor.distribution(observation.index_select(0, piece))
+                    change = policy.log_prob(action[piece]).sum(-1) - log_prob[piece]
+                    spread = policy.entropy().sum(-1).mean()
+                    loss = -surrogate(change, psi_of, settings.clip) - settings.entropy * spread
+                    (loss * (len(piece) / len(part))).backward()
+                    # k3 estimator of KL(old, new): unbiased and never negative
+                    divergence += float((change.exp() - 1 - change).sum().detach()) / len(weight)
+                    entropy = float(spread.detach())
+                _step(self.actor_optimizer, settings.max_grad_norm)
             self._follow_divergence(divergence)
         rate = self.actor_optimizer.param_groups[0]["lr"]
         return {"kl": divergence, "entropy": entropy, "actor_rate": rate}
@@ -269,7 +272,9 @@ class Trainer:
             for part in parts:
                 value = self.critic.normalized(inputs.index_select(0, part))
                 loss = value_loss(value, before[part], aim[part], reach)
-                _descend(self.critic_optimizer, loss, settings.max_grad_norm)
+                self.critic_optimizer.zero_grad()
+                loss.backward()
+                _step(self.critic_optimizer, settings.max_grad_norm)
                 error += float((value.detach() - aim[part]).square().mean()) / len(parts)
         return {"value_loss": error, "explained": 1 - error / float(aim.var())}
 
@@ -280,15 +285,15 @@ class Trainer:
             BundleError: it is none, or its network is another than the settings'.
         """
         form = load_network(path).form  # nothing in the file is believed before it is checked
-        if form != Form():
-            raise BundleError(f"{path}: {Form()!r} is allowed, got {form!r}")
+        if form != self.actor.form:
+            raise BundleError(f"{path}: {self.actor.form!r} is allowed, got {form!r}")
         settings = self.settings
         samples = settings.num_envs * settings.rollout * self.env.num_agents
         self.actor.adopt(load_file(path), _START_COUNTS * samples)
 
     def save_policy(self, path: Path) -> None:
         """Write the policy file: the mean action's network."""
-        save_network(self.actor.tensors(), path)
+        save_network(self.actor.tensors(), path, self.actor.form)
 
     def save_networks(self, path: Path) -> None:
         """Write actor and critic with all they normalise by, as safetensors: what an audit needs."""
@@ -344,6 +349,7 @@ def networks(settings: Settings, layout: TaskLayout) -> tuple[Actor, Critic]:
         layout.action.size,
         settings.actor_hidden,
         settings.std,
+        form=AttentionForm.of(layout.observation, *settings.attends) if settings.attends else Form(),
         normalize=settings.normalize_inputs,
     )
     local = settings.arm == "local"
@@ -387,8 +393,6 @@ def value_loss(
     return error.mean()
 
 
-def _descend(optimizer: torch.optim.Optimizer, loss: Tensor, max_norm: float) -> None:
-    optimizer.zero_grad()
-    loss.backward()
+def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> None:
     torch.nn.utils.clip_grad_norm_([p for group in optimizer.param_groups for p in group["params"]], max_norm)
     optimizer.step()

@@ -1,25 +1,26 @@
-"""The actor, the central critic and running normalisation."""
+"""Actors, the central critic and running normalisation."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hipg_bench.errors import BundleError
-from hipg_bench.policies.network import CLIP
+from hipg_bench.policies.network import CLIP, AttentionForm, Form
 
 
 class RunningNorm(nn.Module):
     """Running mean and scale of a vector, by Chan's parallel update.
 
     Columns in ``fixed`` pass through unchanged: health must, since a critic is asked about deaths it
-    has hardly seen, and dividing by their tiny deviation would throw its input far off.
+    has hardly seen, and dividing by their tiny deviation would throw its input far off. Each array in
+    ``shared`` (slots, entry) names columns that say the same of several slots, and are normalised alike.
     """
 
     count: Tensor
@@ -27,8 +28,9 @@ class RunningNorm(nn.Module):
     square: Tensor
     free: Tensor
 
-    def __init__(self, size: int, fixed: np.ndarray | None = None) -> None:
+    def __init__(self, size: int, fixed: np.ndarray | None = None, shared: Sequence[np.ndarray] = ()) -> None:
         super().__init__()
+        self.shared = [torch.as_tensor(columns) for columns in shared]
         free = torch.ones(size, dtype=torch.bool)
         if fixed is not None:
             free[torch.as_tensor(fixed)] = False
@@ -43,9 +45,14 @@ class RunningNorm(nn.Module):
         if len(x) == 0:
             return
         x = x.double()
-        fresh = x.mean(0) - self.mean
+        mean, variance = x.mean(0), x.var(0, unbiased=False)
+        for columns in self.shared:
+            of_slots = mean[columns]
+            variance[columns] = variance[columns].mean(0) + of_slots.var(0, unbiased=False)
+            mean[columns] = of_slots.mean(0)
+        fresh = mean - self.mean
         total = self.count + len(x)
-        self.square += x.var(0, unbiased=False) * len(x) + fresh**2 * self.count * len(x) / total
+        self.square += variance * len(x) + fresh**2 * self.count * len(x) / total
         self.mean += fresh * len(x) / total
         self.count.copy_(total)
 
@@ -91,8 +98,86 @@ def mlp(sizes: tuple[int, ...], activation: type[nn.Module], last_gain: float) -
     return nn.Sequential(*layers)
 
 
+class AttentionBody(nn.Module):
+    """What `hipg_bench.policies.attention.Attention` computes, to be trained: one head, D the first width.
+
+    An agent asks one question, so keys and values of every slot need not be made: the question is taken to
+    the embeddings of the slots, and these are mixed before they become a value.
+    """
+
+    def __init__(self, form: AttentionForm, hidden: tuple[int, ...], action_size: int) -> None:
+        super().__init__()
+        own, slots = form.columns()
+        size, gain = hidden[0], math.sqrt(2)
+        self._own = torch.as_tensor(own)
+        self._slots = {group: torch.as_tensor(columns) for group, columns in slots.items()}
+        self._present = form.present_columns()
+        self.own = mlp((own.size, size), Tanh, gain)
+        self.slot = nn.ModuleDict(
+            {group: mlp((at.shape[1], size), Tanh, gain) for group, at in slots.items()}
+        )
+        self.attention = nn.MultiheadAttention(size, num_heads=1)
+        self.head = mlp((2 * size, *hidden[1:], action_size), Tanh, 0.01)
+        self._activation = Tanh()
+
+    def forward(self, x: Float[Tensor, "*lead O"]) -> Float[Tensor, "*lead A"]:
+        """Mean action; ``x`` is normalised, but for the columns that say whether a slot holds somebody."""
+        lead, x = x.shape[:-1], x.flatten(0, -2)
+        own = self._activation(self.own(x[:, self._own]))
+        embedded = [self.slot[group](x[:, columns]) for group, columns in self._slots.items()]
+        answer = self._ask(own, self._activation(torch.cat(embedded, dim=1)), self._there(x))
+        return self.head(torch.cat([own, answer], dim=1)).unflatten(0, lead)
+
+    def _there(self, x: Float[Tensor, "X O"]) -> Bool[Tensor, "X slots"]:
+        """Which slots hold somebody."""
+        there: list[Tensor] = []
+        for group, columns in self._slots.items():
+            present = self._present[group]
+            all_are = torch.ones(len(x), len(columns), dtype=torch.bool)
+            there.append(all_are if present is None else x[:, torch.as_tensor(present)] > 0)
+        return torch.cat(there, dim=1)
+
+    def _ask(
+        self, own: Float[Tensor, "X D"], token: Float[Tensor, "X slots D"], there: Bool[Tensor, "X slots"]
+    ) -> Float[Tensor, "X D"]:
+        """The attention's answer to the own embedding; zeros where nobody is there."""
+        attention, size = self.attention, own.shape[1]
+        ask, key, value = attention.in_proj_weight.split(size)
+        ask_bias, _, value_bias = attention.in_proj_bias.split(size)  # the keys' adds the same to every fit
+        question = nn.functional.linear(own, ask, ask_bias) @ key / math.sqrt(size)
+        fit = (question[:, None] * token).sum(-1)
+        somebody = there.any(dim=1, keepdim=True)
+        share = fit.masked_fill(~there & somebody, -torch.inf).softmax(dim=1)
+        mixed = (share[:, :, None] * token).sum(1)
+        return attention.out_proj(nn.functional.linear(mixed, value, value_bias)) * somebody
+
+    def weights(self) -> dict[str, Tensor]:
+        """Parameters by their names in a policy file."""
+        embeddings = {"own": self.own} | dict(self.slot.items())
+        named = [
+            (name, parameter) for name, module in embeddings.items() for parameter in module.parameters()
+        ]
+        out = {f"{name}.{'weight' if p.dim() == 2 else 'bias'}": p for name, p in named}
+        out |= {f"attention.{name}": parameter for name, parameter in self.attention.named_parameters()}
+        return out | _stack(self.head)
+
+
+def _stack(layers: nn.Module) -> dict[str, Tensor]:
+    """Parameters of linear layers by their names in a policy file."""
+    linears = [layer for layer in layers.children() if isinstance(layer, nn.Linear)]
+    return {
+        f"layer{k}.{name}": parameter
+        for k, layer in enumerate(linears)
+        for name, parameter in layer.named_parameters()
+    }
+
+
 class Actor(nn.Module):
-    """A Gaussian policy shared by all agents: each acts on its own observation alone."""
+    """A Gaussian policy shared by all agents: each acts on its own observation alone.
+
+    Attributes:
+        form: of its mean action's network, which `tensors` are the weights of.
+    """
 
     def __init__(
         self,
@@ -101,11 +186,20 @@ class Actor(nn.Module):
         hidden: tuple[int, ...],
         std: float,
         *,
+        form: Form,
         normalize: bool = True,
     ) -> None:
         super().__init__()
-        self.norm = RunningNorm(observation_size, None if normalize else np.arange(observation_size))
-        self.body = mlp((observation_size, *hidden, action_size), Tanh, 0.01)
+        self.form = form
+        fixed = None if normalize else np.arange(observation_size)
+        if isinstance(form, AttentionForm):
+            present = [columns for columns in form.present_columns().values() if columns is not None]
+            fixed = np.concatenate([np.empty(0, np.int64), *present]) if normalize else fixed
+            self.norm = RunningNorm(observation_size, fixed, shared=list(form.columns()[1].values()))
+            self.body = AttentionBody(form, hidden, action_size)
+        else:
+            self.norm = RunningNorm(observation_size, fixed)
+            self.body = mlp((observation_size, *hidden, action_size), Tanh, 0.01)
         self.log_std = nn.Parameter(torch.full((action_size,), math.log(std)))
 
     def forward(self, observation: Float[Tensor, "... O"]) -> torch.distributions.Normal:
@@ -133,18 +227,16 @@ class Actor(nn.Module):
             raise BundleError(f"a start must have tensors {own}, got {theirs}")
         given = {name: torch.from_numpy(tensor) for name, tensor in tensors.items()}
         self.norm.adopt(given["observation.mean"], given["observation.scale"], count)
-        linears = [layer for layer in self.body if isinstance(layer, nn.Linear)]
-        for k, layer in enumerate(linears):
-            layer.weight.copy_(given[f"layer{k}.weight"])
-            layer.bias.copy_(given[f"layer{k}.bias"])
+        for name, parameter in self._weights().items():
+            parameter.copy_(given[name])
 
     def tensors(self) -> dict[str, np.ndarray]:
         """What `hipg_bench.policies.network.save_network` writes: the mean action's network."""
-        linears = [layer for layer in self.body if isinstance(layer, nn.Linear)]
-        out = {"observation.mean": self.norm.offset, "observation.scale": self.norm.scale}
-        for k, layer in enumerate(linears):
-            out |= {f"layer{k}.weight": layer.weight, f"layer{k}.bias": layer.bias}
+        out = {"observation.mean": self.norm.offset, "observation.scale": self.norm.scale} | self._weights()
         return {name: tensor.detach().numpy().copy() for name, tensor in out.items()}
+
+    def _weights(self) -> dict[str, Tensor]:
+        return self.body.weights() if isinstance(self.body, AttentionBody) else _stack(self.body)
 
 
 class Critic(nn.Module):

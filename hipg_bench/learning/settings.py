@@ -91,6 +91,9 @@ class Settings(RunSettings):
         max_grad_norm: gradients are cut to this norm.
         std: exploration's first standard deviation, in units of full action.
         actor_hidden, critic_hidden: widths of the hidden layers.
+        attends: groups of observation blocks, by what their names begin with, that the actor looks at slot by
+            slot (`hipg_bench.policies.attention`; ``actor_hidden`` begins with the embeddings' width); none:
+            it is an MLP of the whole observation.
         mask_dead: dead agents' samples take no part in the actor's update; else only the arm
             ``min_health`` leaves them without weight, as in the authors' code.
         zero_dead_actions: a dead agent's action is stored as zeros beside the log-probability of what
@@ -122,6 +125,7 @@ class Settings(RunSettings):
     std: float = pydantic.Field(default=0.6, gt=0, le=5)
     actor_hidden: tuple[int, ...] = (128, 128)
     critic_hidden: tuple[int, ...] = (256, 256)
+    attends: tuple[str, ...] = ()
     mask_dead: bool = True
     zero_dead_actions: bool = False
     psi_over: Literal["live", "batch", "minibatch"] = "live"
@@ -230,7 +234,11 @@ _EPISODES_PER_TRIAL = 1000
 """A policy is tried each time so many episodes could have been played: 3 % of the time or less."""
 _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     # what a drone does shows in the team's distances at once: a short trace has less of the others' luck
-    "hazard_nav": {"minibatches": 8, "gamma": 0.9, "lam": 0.9, "entropy": 0.008},
+    "hazard_nav": {
+        "minibatches": 8, "gamma": 0.9, "lam": 0.9, "entropy": 0.008,
+        # one way of looking at every point: what an MLP has to learn for each of them anew
+        "attends": ("point", "neighbor"), "actor_hidden": (32, 128), "steps": 2_000_000,
+    },
     # reward is so rare at first that noise would collapse exploration without a strong bonus
     "hazard_comm": {"epochs": 4, "minibatches": 8, "entropy": 0.01},
     "multiwalker": {
