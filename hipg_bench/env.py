@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench import episode
 from hipg_bench.episode import NEVER, memory_fields
 from hipg_bench.errors import ActionError, HipgError
-from hipg_bench.families.family import Family
+from hipg_bench.families.family import Family, Harm
 from hipg_bench.families.scene import without_visuals
 from hipg_bench.layout import TaskLayout
 from hipg_bench.mechanics import health as health_law
@@ -162,17 +162,7 @@ class BatchEnv:
 
         # harm becomes death
         field["elapsed"] += 1
-        harm = family.harm(was, now)
-        if not harm.none:
-            health, field["exposure"][:] = health_law.damage(
-                field["health"], field["exposure"], field["toughness"], harm.exposure, harm.fatal,
-                graded=self.spec.graded_health,
-            )  # fmt: skip
-            died = (health == 0) & (field["health"] > 0)
-            np.copyto(field["death_time"], field["elapsed"], where=died)
-            np.copyto(field["death_cause"], harm.cause, where=died)
-            field["health"][:] = now.health[:] = health
-            sim.disable(health == 0)
+        self._wound(now, family.harm(was, now))
         now = family.remember(sim, was, now)
 
         # the team is paid, and told how it ended
@@ -323,6 +313,23 @@ class BatchEnv:
             for name, value in told.items():
                 out[name][ids] = value
         return out
+
+    def _wound(self, now: Any, harm: Harm) -> None:
+        """Turn harm into death, in the snapshot too; actuators of the dead are cut."""
+        sim, field, hurt = self._sim, self._sim.field, harm.cases
+        if not len(hurt[0]):
+            return
+        had = field["health"][hurt]
+        health, field["exposure"][hurt] = health_law.damage(
+            had, field["exposure"][hurt], field["toughness"][hurt], harm.exposure[hurt], harm.fatal[hurt],
+            graded=self.spec.graded_health,
+        )  # fmt: skip
+        field["health"][hurt] = now.health[hurt] = health
+        died = tuple(axis[(health == 0) & (had > 0)] for axis in hurt)
+        if len(died[0]):
+            field["death_time"][died] = field["elapsed"][died[0], 0]
+            field["death_cause"][died] = harm.cause[died]
+            sim.disable(now.health == 0)
 
     def _pay_floor(
         self, terms: dict[str, Float[np.ndarray, "B"]], diverged: Bool[np.ndarray, "B"]

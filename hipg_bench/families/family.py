@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench.layout import TaskLayout
+from hipg_bench.mechanics.few import few
 from hipg_bench.sim import Sim
 
 EVERY = slice(None)
@@ -35,9 +36,9 @@ class Harm:
     cause: Int[np.ndarray, "B N"]
 
     @property
-    def none(self) -> bool:
-        """Whether nobody came to any."""
-        return not (self.exposure.any() or self.fatal.any())
+    def cases(self) -> tuple[Int[np.ndarray, "n"], ...]:
+        """Worlds and agents of the n that came to any."""
+        return few((self.exposure > 0) | self.fatal)
 
 
 @runtime_checkable

@@ -115,7 +115,7 @@ class PaperComm(particles.Particles[Snapshot]):
         field["connected_steps"][:, 0] += now.connected
         if not self._law.collision_risk:  # else they are counted already
             alive = was.health > 0
-            plane.count_overlaps(now.position, alive, 2 * self.radius, np.empty(alive.shape), now.overlaps)
+            self._count_overlaps(now, alive)
         field["collisions"][:, 0] += now.overlaps[:, 0]
         self._keep(sim, was, now)
         return now
@@ -188,6 +188,6 @@ class PaperComm(particles.Particles[Snapshot]):
 
     def _connected(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
         """Whether live agents link the terminals; terminals do not hear each other."""
-        linked, terminals = np.empty(len(now.health), bool), now.point[:, :_HAZARD].copy()
-        plane.find_links(now.position, now.health > 0, terminals, self.link_range, linked)
+        linked, alive, ends = np.empty(len(now.health), bool), now.health > 0, now.point[:, :_HAZARD].copy()
+        plane.find_links(now.position, alive, ends, self.link_range, linked)
         return linked

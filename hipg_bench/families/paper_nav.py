@@ -116,7 +116,7 @@ class PaperNav(particles.Particles[Snapshot]):
         world, _, point = now.exposed
         now.revealed[world, point] = True
         alive = now.health > 0
-        plane.count_overlaps(now.position, alive, 2 * self.radius, np.empty(alive.shape), now.overlaps)
+        self._count_overlaps(now, alive)
         covers = np.ones_like(alive) if self.params.dead_cover else alive
         plane.sum_gaps(now.position, covers, now.point, ~now.hazardous, self.params.nobody, now.gap)
         field = sim.field

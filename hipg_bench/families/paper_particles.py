@@ -67,6 +67,7 @@ class Snapshot:
 
     position: Float[np.ndarray, "B N 2"]  # m
     velocity: Float[np.ndarray, "B N 2"]  # m/s; of the dead, the one they died with
+    closest: Float[np.ndarray, "B"]  # squared distance of the two closest agents, m^2
     health: Float[np.ndarray, "B N"]
     point: Float[np.ndarray, "B L 2"]  # landmarks, or terminals and the hazard, m
     exposed: tuple[Int[np.ndarray, "M"], ...]  # world, agent, point: the M cases of an agent in a hazard
@@ -109,11 +110,17 @@ class Particles(abc.ABC, Generic[S]):
         if not alive.all():
             np.copyto(sim.velocity, 0.0, where=np.repeat(~alive, 2, axis=1))
         sim.control[:] = action.reshape(len(action), -1)
-        push = np.empty(was.position.shape)
+        force = np.empty(was.position.shape)
         plane.push_apart(
-            was.position, alive, 2 * self.radius, law.contact_stiffness, law.contact_margin, push
+            was.position,
+            was.closest,
+            alive,
+            2 * self.radius,
+            law.contact_stiffness,
+            law.contact_margin,
+            force,
         )
-        sim.applied[:] = self._factor * push.reshape(len(action), -1)
+        sim.applied[:] = self._factor * force.reshape(len(action), -1)
 
     def renew(self, sim: Sim, now: S, ids: Int[np.ndarray, "n"], fresh: S) -> S:
         """Put the fresh worlds into the arrays of the others."""
@@ -184,23 +191,25 @@ class Particles(abc.ABC, Generic[S]):
             rows: which.
             hazardous: points that harm.
         """
-        field, n = sim.field, self.spec.num_agents
-        health = field["health"][rows].copy()
-        position = sim.position[rows].reshape(-1, n, 2).copy()
-        velocity = sim.velocity[rows].copy()
-        if not health.all():
-            # the dead are seen with the velocity they died with
-            np.copyto(velocity, field["velocity"][rows], where=np.repeat(health == 0, 2, axis=1))
-        point = sim.marker[rows][..., :2].copy()
-        exposed = np.empty((*health.shape, point.shape[1]), bool)
+        field, health = sim.field, sim.field["health"][rows].copy()
+        worlds, agents = health.shape
+        position, velocity = np.empty((worlds, agents, 2)), np.empty((worlds, agents, 2))
+        point, closest = np.empty((*hazardous.shape, 2)), np.empty(worlds)
+        plane.read(
+            np.arange(sim.num_envs)[rows], sim.position, sim.velocity, field["health"], field["velocity"],
+            sim.marker, position, velocity, point,
+        )  # fmt: skip
+        plane.find_closest(position, closest)
+        exposed = np.empty((worlds, agents, hazardous.shape[1]), bool)
         plane.find_within(position, point, hazardous, self._law.hazard_radius, exposed)
         return {
-            "health": health,
             "position": position,
-            "velocity": velocity.reshape(-1, n, 2),
+            "velocity": velocity,
+            "closest": closest,
+            "health": health,
             "point": point,
             "exposed": few(exposed),
-            "overlaps": np.zeros((len(health), 2)),  # once it is known who lives
+            "overlaps": np.zeros((worlds, 2)),  # once it is known who lives
             "sim": sim,
             "rows": rows,
         }
@@ -227,11 +236,15 @@ class Particles(abc.ABC, Generic[S]):
 
     def _crash(self, now: S, alive: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
         """Exposure of each agent from its contacts, nats."""
-        touching = np.zeros(alive.shape)
         if not self._law.collision_risk:
-            return touching
-        plane.count_overlaps(now.position, alive, 2 * self.radius, touching, now.overlaps)
-        return -np.log1p(-self._law.collision_risk) * touching
+            return np.zeros(alive.shape)
+        return -np.log1p(-self._law.collision_risk) * self._count_overlaps(now, alive)
+
+    def _count_overlaps(self, now: S, alive: Bool[np.ndarray, "B N"]) -> Float[np.ndarray, "B N"]:
+        """Count overlapping pairs; return with how many others each live agent overlaps."""
+        touching = np.empty(alive.shape)
+        plane.count_overlaps(now.position, now.closest, alive, 2 * self.radius, touching, now.overlaps)
+        return touching
 
 
 def deaths_by_cause(sim: Sim, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "n"]]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Float32, Shaped
 
 from hipg_bench.layout import Block, Layout
-from hipg_bench.mechanics import histogram, plane
+from hipg_bench.mechanics import histogram, looks
 from hipg_bench.native import on_threads
 
 CELLS = (histogram.RINGS, histogram.SECTORS)
@@ -38,7 +38,7 @@ def around_blocks() -> tuple[Block, ...]:
     """What every histogram observation ends with, per step."""
     return (
         Block("other_count", CELLS, "agents", "own", f"{IN_RANGE}, live agents"),
-        Block("dead_position", (plane.LISTED, 2), "m", "own", "nearest dead agents, at any distance"),
+        Block("dead_position", (looks.LISTED, 2), "m", "own", "nearest dead agents, at any distance"),
     )
 
 
@@ -80,7 +80,7 @@ def look(
     both = np.empty((*dead.shape, 2 * layout.size), np.float32)
 
     def see(part: slice) -> None:
-        plane.see(
+        looks.see(
             now.position[part], now.velocity[part], dead[part], now.point[part], hints.shown[part],
             hints.known[part], hints.told[part], past[part],
             start["other_count"], points, start["dead_position"], hazard, seen[part], both[part],

@@ -28,14 +28,14 @@ def hazard_rate(probability: Float[np.ndarray, "..."], steps: float) -> Float[np
 
 
 def damage(
-    health: Float[np.ndarray, "B N"],
-    exposure: Float[np.ndarray, "B N"],
-    toughness: Float[np.ndarray, "B N"],
-    gained: Float[np.ndarray, "B N"],
-    fatal: Bool[np.ndarray, "B N"],
+    health: Float[np.ndarray, "*agents"],
+    exposure: Float[np.ndarray, "*agents"],
+    toughness: Float[np.ndarray, "*agents"],
+    gained: Float[np.ndarray, "*agents"],
+    fatal: Bool[np.ndarray, "*agents"],
     *,
     graded: bool,
-) -> tuple[Float[np.ndarray, "B N"], Float[np.ndarray, "B N"]]:
+) -> tuple[Float[np.ndarray, "*agents"], Float[np.ndarray, "*agents"]]:
     """Apply one step's harm. Health never rises, and the dead gain no exposure.
 
     Args:
