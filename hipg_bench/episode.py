@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hipg_bench.families.family import Family
-from hipg_bench.mechanics import philox
 from hipg_bench.spec import TaskSpec
 
 NEVER = -1.0
@@ -29,9 +28,14 @@ def memory_fields(spec: TaskSpec, family: Family) -> dict[str, int]:
 
 def draw(seed: int, episodes: Int[np.ndarray, "n"], size: int) -> Float[np.ndarray, "n size"]:
     """All chance of some episodes: uniform numbers that depend on the seed and the episode alone."""
-    # the episode takes the counter's highest word: draws advance the lowest, so streams never meet
-    key, chance = np.random.Philox(key=seed).state["state"]["key"], np.empty((len(episodes), size))
-    philox.uniform(key, episodes.astype(np.uint64), chance)
+    philox = np.random.Philox(key=seed)
+    generator, start = np.random.Generator(philox), philox.state
+    chance = np.empty((len(episodes), size))
+    for row, episode in zip(chance, episodes.tolist(), strict=True):
+        # the episode takes the counter's highest word: draws advance the lowest, so streams never meet
+        start["state"]["counter"][3] = episode
+        philox.state = start
+        generator.random(out=row)
     return chance
 
 
