@@ -32,7 +32,7 @@ class RunSettings(Params):
 
     task: str
     seed: int = pydantic.Field(default=0, ge=0, le=999)
-    steps: int = pydantic.Field(default=3_000_000, ge=1)
+    steps: int = pydantic.Field(default=2_000_000, ge=1)
     num_envs: int = pydantic.Field(default=256, ge=1, le=65536)
     rollout: int = pydantic.Field(default=50, ge=1, le=10_000)
     gamma: float = pydantic.Field(default=0.98, ge=0, le=1)
@@ -237,10 +237,13 @@ _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     "hazard_nav": {
         "minibatches": 8, "gamma": 0.9, "lam": 0.9, "entropy": 0.008,
         # one way of looking at every point: what an MLP has to learn for each of them anew
-        "attends": ("point", "neighbor"), "actor_hidden": (32, 128), "steps": 2_000_000,
+        "attends": ("point", "neighbor"), "actor_hidden": (32, 128),
     },
     # reward is so rare at first that noise would collapse exploration without a strong bonus
-    "hazard_comm": {"epochs": 4, "minibatches": 8, "entropy": 0.01},
+    "hazard_comm": {
+        "epochs": 4, "minibatches": 8, "entropy": 0.01,
+        "attends": ("neighbor", "wreck"), "actor_hidden": (32, 128),
+    },
     "multiwalker": {
         "steps": 8_000_000, "num_envs": 512, "rollout": 32, "minibatches": 6, "gamma": 0.99,
         "entropy": 0.002, "std": 0.5,
