@@ -235,7 +235,7 @@ _EPISODES_PER_TRIAL = 1000
 _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     # what a drone does shows in the team's distances at once: a short trace has less of the others' luck
     "hazard_nav": {
-        "minibatches": 8, "gamma": 0.9, "lam": 0.9, "entropy": 0.008,
+        "steps": 3_000_000, "minibatches": 8, "gamma": 0.9, "lam": 0.9, "entropy": 0.008,
         # one way of looking at every point: what an MLP has to learn for each of them anew
         "attends": ("point", "neighbor"), "actor_hidden": (32, 128),
     },
