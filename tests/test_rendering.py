@@ -106,6 +106,38 @@ def test_an_animated_picture_has_the_frames_and_their_duration(navigation, tmp_p
     assert iio.immeta(tmp_path / "a.gif", index=1, plugin="pillow")["duration"] == 1000 / FPS
 
 
+_WITH_AND_WITHOUT_SKY = """
+import sys, mujoco, hipg_bench
+from hipg_bench.rendering.motion import Footage
+from hipg_bench.rendering.painter import Painter, views
+from hipg_bench.rendering.scene import Stage
+env = hipg_bench.make(sys.argv[1], 1, 0, threads=1)
+env.reset()
+footage = Footage(env.spec, env.rows)
+with Painter(footage.model, 640, 360) as painter:
+    (view,) = views(Stage(footage), [0.0], 360)
+    asked = bool(view.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX])
+    pictures = []
+    for sky in (0, 1):
+        view.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
+        pictures.append(painter.paint(view.scene))
+print(asked, bool((pictures[0] != pictures[1]).any()))
+"""
+
+
+@pytest.mark.parametrize("task", ["hazard_nav-8", "hazard_comm-16", "paper_nav-8", "multiwalker-5"])
+def test_the_sky_is_painted_where_it_can_be_seen(task):
+    backend = gl.working_backend()
+    if backend is None:
+        pytest.skip(f"no OpenGL works here; {gl.MEND}")
+    done = subprocess.run(
+        [sys.executable, "-c", _WITH_AND_WITHOUT_SKY, task],
+        env=gl.environment(backend), capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    visible = str(task.startswith("multiwalker"))
+    assert done.stdout.split() == [visible, visible]
+
+
 # failures
 
 

@@ -64,9 +64,9 @@ class Brush:
     def disc(
         self, place: Point, radius: float, colour: Colour, alpha: float = 1.0, glow: float = 0.3
     ) -> None:
-        """A flat horizontal disc."""
-        size = (radius, 0.0005, 0.0)
-        self._add(mujoco.mjtGeom.mjGEOM_CYLINDER, size, place, _UPRIGHT, colour, alpha, glow)
+        """A flat horizontal disc; an ellipsoid has a third of a cylinder's triangles."""
+        size = (radius, radius, 0.0005)
+        self._add(mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, place, _UPRIGHT, colour, alpha, glow)
 
     def box(self, place: Point, half: Point, colour: Colour, alpha: float = 1.0, glow: float = 0.0) -> None:
         """A box along the world's axes."""

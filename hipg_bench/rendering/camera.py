@@ -11,6 +11,8 @@ from jaxtyping import Float
 
 FIELD_OF_VIEW = 38.0
 """Vertical, degrees; that of ``arena.xml``."""
+_FLOOR = 19.0
+"""Up to here the floor of ``arena.xml`` hides all behind it; farther on it fades into the sky, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +37,13 @@ class Camera:
         azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
         level = np.cos(elevation)
         return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+
+    @property
+    def sees_sky(self) -> bool:
+        """Whether the upper edge of the picture looks beyond the floor."""
+        eye = self.target[2] - self.distance * self.ahead[2]
+        steepness = np.tan(np.radians(-self.elevation - FIELD_OF_VIEW / 2))
+        return bool(eye > _FLOOR * steepness)
 
     def mujoco(self) -> mujoco.MjvCamera:
         """The same for MuJoCo."""

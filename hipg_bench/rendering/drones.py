@@ -62,7 +62,7 @@ class Drones:
         azimuth = 78.0 + 26.0 * share
         # a little to the left of the middle, since panels cover the left of the picture
         left = 0.10 * self._half * np.array([-np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth)), 0.0])
-        return Camera(left + 0.37 * self._ceiling * _Z, distance, azimuth, -23.0)
+        return Camera(left + 0.37 * self._ceiling * _Z, distance, azimuth, -24.5)
 
     def draw_arena(self, brush: Brush, time: float) -> None:
         """The floor within the walls, the box that drones cannot leave, trails and plumb lines."""

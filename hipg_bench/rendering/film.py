@@ -180,7 +180,7 @@ def _frames(job: Job, rows: Float[np.ndarray, "K R"]) -> Iterator[tuple[bytes, i
     # graphics are touched here and in the child only
     from hipg_bench.rendering.hud import Caption, Hud, Reading
     from hipg_bench.rendering.motion import Footage
-    from hipg_bench.rendering.painter import Painter
+    from hipg_bench.rendering.painter import Painter, View, views
     from hipg_bench.rendering.scene import Stage
 
     footage = Footage(job.spec, rows)
@@ -192,16 +192,17 @@ def _frames(job: Job, rows: Float[np.ndarray, "K R"]) -> Iterator[tuple[bytes, i
     held = round(_CARD * job.fps)
     total = len(times) + held
 
-    def paint() -> Iterator[tuple[Any, ...]]:
-        with Painter(stage, job.width, job.height) as painter:
-            for time in times.tolist():
-                frame, camera, labels, status = painter.paint(time)
-                now = footage.remembered(time)
-                yield frame, camera, labels, Reading(time, float(now["return"][0]), now["health"], status)
+    def painted(composed: Iterator[View]) -> Iterator[tuple[View, np.ndarray]]:
+        with Painter(footage.model, job.width, job.height) as painter:
+            for view in composed:
+                yield view, painter.paint(view.scene)
 
     picture = hud.blank
-    for painted in ahead(paint()):
-        picture = hud.write(*painted)
+    # while a view is painted, the next one is composed and the one before is written on and encoded
+    for view, frame in ahead(painted(ahead(views(stage, times.tolist(), job.height)))):
+        now = footage.remembered(view.time)
+        reading = Reading(view.time, float(now["return"][0]), now["health"], view.status)
+        picture = hud.write(frame, view.camera, view.labels, reading)
         yield picture.tobytes(), total
     headline, lines = _ending(job, footage.remembered(footage.time[-1]))
     for k in range(held):

@@ -173,7 +173,7 @@ def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
     # graphics are touched here and in the child only
     from hipg_bench.rendering.hud import Caption, Hud, Reading
     from hipg_bench.rendering.motion import Footage
-    from hipg_bench.rendering.painter import Painter
+    from hipg_bench.rendering.painter import Painter, views
     from hipg_bench.rendering.scene import Stage
 
     messages = _messages()
@@ -182,15 +182,19 @@ def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
     stage = Stage(footage)
     duration = spec.horizon * spec.control_step
     hud = Hud(Caption(spec.task, "", stage.legend, 1.0, duration, stage.cast.colour), *SIZE)
-    with Painter(stage, *SIZE) as painter:
+
+    def latest() -> Iterator[float]:
         for rows in itertools.chain([first[1:]], messages):
             for row in rows:
                 footage.append(row)
-            time = float(footage.time[-1])
-            frame, camera, labels, status = painter.paint(time)
-            now = footage.remembered(time)
-            reading = Reading(time, float(now["return"][0]), now["health"], status)
-            out.write(hud.write(frame, camera, labels, reading).tobytes())
+            yield float(footage.time[-1])
+
+    with Painter(footage.model, *SIZE) as painter:
+        for view in views(stage, latest(), SIZE[1]):
+            now = footage.remembered(view.time)
+            reading = Reading(view.time, float(now["return"][0]), now["health"], view.status)
+            frame = painter.paint(view.scene)
+            out.write(hud.write(frame, view.camera, view.labels, reading).tobytes())
             out.flush()
 
 

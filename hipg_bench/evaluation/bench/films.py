@@ -135,18 +135,21 @@ def _film(
 def _bare(
     spec: TaskSpec, rows: Float[np.ndarray, "K R"], out: Path, size: tuple[int, int], frames: int
 ) -> _Shutter:
-    """MuJoCo's renderer and the encoder, with the film's view and light."""
-    stage = Stage(Footage(spec, rows))
-    model, camera = stage.footage.model, stage.camera(0.0).mujoco()
+    """MuJoCo's renderer and the encoder, with the film's light, moments and views (worked out before)."""
+    footage = Footage(spec, rows)
+    stage, model = Stage(footage), footage.model
+    times = np.linspace(footage.time[0], footage.time[-1], frames).tolist()
+    poses: list[tuple[np.ndarray, np.ndarray, mujoco.MjvCamera]] = []
+    for moment in times:
+        footage.show(moment)
+        poses.append((footage.data.qpos.copy(), footage.data.mocap_pos.copy(), stage.camera(moment).mujoco()))
     data = mujoco.MjData(model)
     shutter = _Shutter()
     encoder = _encoder(out, size)
     encoder.send(None)
     with contextlib.closing(encoder), mujoco.Renderer(model, size[1], size[0]) as renderer:
-        for k in range(frames):
-            mujoco.mj_setState(
-                model, data, rows[k * len(rows) // frames], mujoco.mjtState.mjSTATE_INTEGRATION
-            )
+        for qpos, mocap_pos, camera in poses:
+            data.qpos[:], data.mocap_pos[:] = qpos, mocap_pos
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             encoder.send(renderer.render())
