@@ -183,9 +183,11 @@ def hipg_pettingzoo(task: str) -> Contender:
 
 def hipg_mappo(task: str) -> Contender:
     """Whole training iterations of our MAPPO, min-health crediting included."""
+    from hipg_bench.learning import arithmetic
     from hipg_bench.learning.mappo import Trainer
     from hipg_bench.learning.settings import Settings, recommended
 
+    arithmetic.prepare()  # as `hipg-bench train` does
     settings = recommended(task)
     if not isinstance(settings, Settings):
         raise TypeError(f"MAPPO's settings are compared, got {settings!r}")
