@@ -1,6 +1,8 @@
 """Blind policies are pure and independent of the batch; bundles are data and are refused with a reason."""
 
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scipy import stats
 
 from hipg_bench import make, task_spec
 from hipg_bench.errors import BundleError, UnknownNameError
+from hipg_bench.paths import data_folder
 from hipg_bench.policies.bundle import agents, load_agent
 from hipg_bench.policies.network import save_network
 from hipg_bench.policies.simple import Constant, Random, TimeOnly, Zero
@@ -242,12 +245,15 @@ def test_weights_for_another_task_do_not_fit(network):
         agent.policy(task_spec("hazard_nav-4").override(num_agents=5))
 
 
-def test_a_film_takes_the_first_training_whatever_its_seed() -> None:
-    """The bundled team for eight drones is of training seed 1 alone: without being told, a film finds it."""
+def test_a_film_takes_the_first_training_whatever_its_seed(tmp_path: Path) -> None:
+    """A team of training seed 1 alone: without being told, a film finds it."""
     from hipg_bench.cli.media import _policy
 
-    who, spec = load_agent("mappo_minhealth"), task_spec("hazard_nav-8")
-    assert 0 not in who.train_seeds("hazard_nav-8")
+    bundled = data_folder("agents") / "mappo_minhealth"
+    (tmp_path / "hazard_nav-8").mkdir()
+    shutil.copy(bundled / "agent.toml", tmp_path)
+    shutil.copy(bundled / "hazard_nav-8/seed0.safetensors", tmp_path / "hazard_nav-8/seed1.safetensors")
+    who, spec = load_agent(str(tmp_path)), task_spec("hazard_nav-8")
     assert _policy(who, spec, None).action_size == 3
     with pytest.raises(BundleError):
         _policy(who, spec, 0)
