@@ -286,10 +286,7 @@ class Trainer:
         """
         form = load_network(path).form  # nothing in the file is believed before it is checked
         if form != self.actor.form:
-            raise BundleError(
-                f"{path}: a start must declare the network of this run (its observation, attends), "
-                f"{self.actor.form!r}, got {form!r}"
-            )
+            raise BundleError(f"{path}: a start must declare this run's {self.actor.form!r}, got {form!r}")
         settings = self.settings
         samples = settings.num_envs * settings.rollout * self.env.num_agents
         self.actor.adopt(load_file(path), _START_COUNTS * samples)
