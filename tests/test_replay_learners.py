@@ -356,7 +356,7 @@ def test_a_finished_run_is_left_alone_and_gives_its_disk_back(arm, tmp_path: Pat
     train(settings, tmp_path, command="test")
     assert (tmp_path / "policy.safetensors").read_bytes() == before
     assert {path.name for path in tmp_path.iterdir()} == {
-        "checkpoint.pt", "policy.safetensors", "curve.csv", "train.json", "tensorboard"
+        "checkpoint.pt", "policy.safetensors", "curve.csv", "train.json", "tensorboard", ".lock"
     }  # fmt: skip
     with pytest.raises(ResumeError, match="replay"):
         train(small(arm, steps=480), tmp_path, command="test")

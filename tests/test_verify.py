@@ -36,7 +36,7 @@ SANDBOXED = any(trial.works for trial in choice.trials().values())
 def network(folder, name="newcomer"):
     """A submission of tier 0: trained weights under a card of its own."""
     (folder / TASK).mkdir(parents=True)
-    (weights,) = (data_folder("agents") / "mappo_minhealth" / TASK).glob("seed*.safetensors")
+    weights = data_folder("agents") / "mappo_minhealth" / TASK / "seed0.safetensors"
     shutil.copyfile(weights, folder / TASK / "seed0.safetensors")
     shutil.copyfile(weights.with_suffix(".curve.csv"), folder / TASK / "seed0.curve.csv")
     (folder / "agent.toml").write_text(f'name = "{name}"\nsummary = "Learns"\nkind = "network"\n')
