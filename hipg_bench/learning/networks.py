@@ -154,10 +154,11 @@ class AttentionBody(nn.Module):
     def weights(self) -> dict[str, Tensor]:
         """Parameters by their names in a policy file."""
         embeddings = {"own": self.own} | dict(self.slot.items())
-        named = [
-            (name, parameter) for name, module in embeddings.items() for parameter in module.parameters()
-        ]
-        out = {f"{name}.{'weight' if p.dim() == 2 else 'bias'}": p for name, p in named}
+        out = {
+            f"{name}.{part}": parameter
+            for name, (linear,) in embeddings.items()
+            for part, parameter in linear.named_parameters()
+        }
         out |= {f"attention.{name}": parameter for name, parameter in self.attention.named_parameters()}
         return out | _stack(self.head)
 
