@@ -155,9 +155,9 @@ class AttentionBody(nn.Module):
         """Parameters by their names in a policy file."""
         embeddings = {"own": self.own} | dict(self.slot.items())
         out = {
-            f"{name}.{part}": parameter
-            for name, (linear,) in embeddings.items()
-            for part, parameter in linear.named_parameters()
+            f"{name}.{path.removeprefix('0.')}": parameter
+            for name, module in embeddings.items()
+            for path, parameter in module.named_parameters()
         }
         out |= {f"attention.{name}": parameter for name, parameter in self.attention.named_parameters()}
         return out | _stack(self.head)
