@@ -17,7 +17,6 @@ from hipg_bench.families.family import Family, Harm
 from hipg_bench.families.scene import without_visuals
 from hipg_bench.layout import TaskLayout
 from hipg_bench.mechanics import health as health_law
-from hipg_bench.native import copied
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec
 
@@ -40,11 +39,11 @@ class Step:
         terminated: (B,) the rules ended the episode.
         truncated: (B,) the horizon ended it.
         info: ``state`` (B, S) float32; ``health`` (B, N); ``alive`` (B, N) bool; ``terms`` name to (B,),
-            weighted, their sum is the reward; ``final_observation`` (B, N, O), ``final_state`` (B, S) and
-            ``final_alive`` (B, N), those of the step itself, whether or not an episode ended; ``metrics``
-            name to (B,), NaN but where an episode ended; ``end_reason`` (B,) str, empty but there;
-            ``episode_id`` (B,) and ``elapsed`` (B,) control steps of the episode that the observation is of;
-            ``final_rows`` (n, R) last rows of the n worlds whose episode ended, in their order.
+            weighted, their sum is the reward; ``final_alive`` (B, N) who outlived the step, whether or not
+            an episode ended; ``metrics`` name to (B,), NaN but where one did; ``end_reason`` (B,) str, empty
+            but there; ``final_observation`` (n, N, O), ``final_state`` (n, S) and ``final_rows`` (n, R), the
+            last of the n worlds whose episode ended, in their order; ``episode_id`` (B,) and ``elapsed``
+            (B,) control steps of the episode that the observation is of.
     """
 
     observation: Float[np.ndarray, "B N O"]
@@ -184,11 +183,10 @@ class BatchEnv:
         # what was seen, then the next episode where this one is over
         observation, state = self._perceive(now)
         info: dict[str, Any] = {
-            "final_observation": observation, "final_state": state, "final_alive": now.health > 0,
+            "final_observation": observation[ended], "final_state": state[ended],
+            "final_rows": sim.rows[ended], "final_alive": now.health > 0,
             "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, ended),
-            "final_rows": sim.rows[ended],
         }  # fmt: skip
-        observation, state = copied(observation, sim.threads), state.copy()
         if len(ended) and self._autoreset:
             self._begin(ended, self._next_episode + np.arange(len(ended)))
             fresh = family.read(sim, ended)
@@ -275,11 +273,10 @@ class BatchEnv:
         observation, state = self._perceive(self._now)
         nothing = np.zeros(self.num_envs, bool)
         info: dict[str, Any] = {
-            "final_observation": observation.copy(), "final_state": state.copy(),
-            "final_alive": self._sim.field["health"] > 0,
+            "final_observation": observation[:0].copy(), "final_state": state[:0].copy(),
+            "final_rows": self._sim.rows[:0].copy(), "final_alive": self._sim.field["health"] > 0,
             "terms": {name: np.zeros(self.num_envs) for name in (*self.spec.weights, "physics")},
             "end_reason": np.full(self.num_envs, ""),
-            "final_rows": self._sim.rows[:0].copy(),
             "metrics": self._measure(self._now, np.empty(0, np.int64)),
         }  # fmt: skip
         info |= self._present(state)

@@ -15,8 +15,6 @@ from concurrent.futures import ThreadPoolExecutor
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
-import numpy as np
-
 _WORTH = 128
 """Worlds per thread from which on another thread pays."""
 
@@ -66,13 +64,6 @@ def on_threads(work: Callable[[slice], None], worlds: int, threads: int) -> None
     work(first)
     for other in others:
         other.result()
-
-
-def copied(array: np.ndarray, threads: int) -> np.ndarray:
-    """A copy of an array of worlds."""
-    copy = np.empty_like(array)
-    on_threads(lambda part: np.copyto(copy[part], array[part]), len(array), threads)
-    return copy
 
 
 @functools.cache

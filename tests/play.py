@@ -73,18 +73,20 @@ def outcomes(env: BatchEnv, first: Step, steps: list[Step]) -> dict[tuple[int, i
     for step in steps:
         keys = zip(was.info["episode_id"].tolist(), was.info["elapsed"].tolist(), strict=True)
         done = step.terminated | step.truncated
-        arrays = {name: array for name, array in flat(step).items() if name != "info.final_rows"}
+        arrays = {name: array for name, array in flat(step).items() if name not in _OF_THE_ENDED}
+        ended = np.flatnonzero(done).tolist()
         for world, key in enumerate(keys):
-            out[key] = {
-                name: array[world].copy()
-                for name, array in arrays.items()
-                # after an ending these belong to the next episode, whose number depends on the batch
-                if not (done[world] and name in _OF_THE_NEXT)
-            }
+            # after an ending some belong to the next episode, whose number depends on the batch
+            kept = arrays.keys() - _OF_THE_NEXT if done[world] else arrays.keys()
+            out[key] = {name: arrays[name][world].copy() for name in kept}
+            if done[world]:
+                k = ended.index(world)
+                out[key] |= {name: step.info[name][k] for name in ("final_observation", "final_state")}
         was = step
     return out
 
 
-_OF_THE_NEXT = (
+_OF_THE_NEXT = {
     "observation", "info.state", "info.health", "info.alive", "info.episode_id", "info.elapsed",
-)  # fmt: skip
+}  # fmt: skip
+_OF_THE_ENDED = {"info.final_observation", "info.final_state", "info.final_rows"}

@@ -1,5 +1,6 @@
 """The learner's mathematics by hand, and runs that go on as if never stopped."""
 
+import copy
 import csv
 import json
 import math
@@ -13,7 +14,8 @@ from hipg_bench import make
 from hipg_bench.errors import BundleError, ResumeError, SpecError
 from hipg_bench.learning import credit
 from hipg_bench.learning.gae import gae
-from hipg_bench.learning.mappo import Trainer, surrogate, value_loss
+from hipg_bench.learning.losses import surrogate, value_loss
+from hipg_bench.learning.mappo import Trainer
 from hipg_bench.learning.networks import RunningNorm, Tanh
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, paper, recommended
@@ -122,7 +124,7 @@ def test_min_health_baseline_is_unbiased() -> None:
     trainer.iterate()  # values away from zero: a bias would show
     data = trainer.roll_out()
     baseline = trainer._value_without_each(data).view_as(data.health)
-    mean = trainer.actor(data.observation).mean
+    mean = trainer.actor(data.observation[:-1]).mean
     # grad of log N(a; mu, sigma) with respect to mu is (a - mu) / sigma^2, sampled from the policy itself
     score = (data.action - mean) / trainer.actor.log_std.exp() ** 2
     sample = (data.health * baseline)[..., None] * score
@@ -142,11 +144,11 @@ def test_a_dead_agents_sample_has_no_gradient() -> None:
     data.health[:, :, 1] = 0.0
     data.observation.requires_grad_(True)
     _, psi = trainer.assign_credit(data)
-    policy = trainer.actor(data.observation)
+    policy = trainer.actor(data.observation[:-1])
     change = policy.log_prob(data.action).sum(-1) - data.log_prob
     surrogate(change.flatten(), psi.flatten(), 0.2).backward()
-    assert (data.observation.grad[:, :, 1] == 0).all()
-    assert (data.observation.grad[:, :, 0] != 0).any()
+    assert (data.observation.grad[:-1, :, 1] == 0).all()
+    assert (data.observation.grad[:-1, :, 0] != 0).any()
 
 
 def test_running_norm_matches_all_data_at_once() -> None:
@@ -336,16 +338,39 @@ def test_every_arm_and_preset_improves_both_networks(preset: str, arm: str) -> N
     assert all((a != b).any() for a, b in zip(before, after, strict=True))
 
 
+@pytest.mark.parametrize("spontaneous_deaths", [0.0, 5.0])
+def test_values_are_bootstrapped_from_what_a_step_led_to(spontaneous_deaths: float) -> None:
+    """With lambda 0 a value target is r + gamma V(next), one world and step at a time."""
+    changes = {**SMALL, "rollout": 60, "lam": 0.0, "spontaneous_deaths": spontaneous_deaths}
+    trainer = Trainer(recommended("hazard_nav-4", **changes))
+    steps, step = [], trainer.env.step
+    trainer.env.step = lambda action: steps.append(step(action)) or steps[-1]
+    data = trainer.roll_out()
+    units = copy.deepcopy(trainer.critic.returns.state_dict())
+    target, _ = trainer.assign_credit(data)
+    trainer.critic.returns.load_state_dict(units)  # what values were in before the targets were taken in
+    for t, now in enumerate(steps):
+        ended = np.flatnonzero(now.truncated).tolist()
+        for b in range(trainer.env.num_envs):
+            led_to = now.info["final_state"][ended.index(b)] if b in ended else now.info["state"][b]
+            share = data.elapsed[t, b] + 1 / 50
+            value = trainer.critic(torch.from_numpy(led_to)[None], share[None]).detach()
+            expected = now.reward[b] + trainer.settings.gamma * float(value)
+            assert float(target[t, b]) == pytest.approx(expected, abs=1e-3)
+    assert len(ended) == 0
+    assert any(now.truncated.any() for now in steps)
+    assert (spontaneous_deaths > 0) == (len(data.ends) > 1)
+
+
 def test_a_local_critic_sees_one_agent_only() -> None:
     trainer = Trainer(recommended("hazard_nav-4", arm="local", **SMALL))
     data = trainer.roll_out()
     target, _ = trainer.assign_credit(data)
     assert target.shape == (10, 8, 4)
-    seen, elapsed = trainer._shown(data.observation, data.state, data.elapsed)
+    seen, elapsed = trainer._shown(data)
     value = trainer.critic(seen, elapsed)
-    changed = data.observation.clone()
-    changed[:, :, 0] += 1.0
-    other = trainer.critic(*trainer._shown(changed, data.state, data.elapsed))
+    data.observation[:, :, 0] += 1.0
+    other = trainer.critic(*trainer._shown(data))
     assert (other[:, :, 0] != value[:, :, 0]).any()
     torch.testing.assert_close(other[:, :, 1:], value[:, :, 1:])
 

@@ -69,7 +69,7 @@ class Diary:
         for world in range(worlds):
             self.steps[world].append((self.shown[world], played[world], led_to[world]))
         self.shown = after
-        replay.add({"played": played}, {"seen": led_to.astype(np.float32)}, done, self.views())
+        replay.add({"played": played}, self.views(), done, {"seen": led_to[done].astype(np.float32)})
 
 
 def replay(folder, window=12, spare=8):
@@ -127,19 +127,19 @@ def test_what_truncation_led_to_is_the_episodes_own_end(tmp_path: Path) -> None:
 
     def watched(action):
         now = step(action)
-        for world in np.flatnonzero(now.truncated):
-            last[world] = now
+        for k, world in enumerate(np.flatnonzero(now.truncated)):
+            last[world] = now, now.info["final_observation"][k]
         return now
 
     trainer.env.step = watched
     trainer.iterate()
     assert len(last) == 8
     arrays, rows = trainer.replay._arrays, trainer.replay._rows
-    for world, now in last.items():
+    for world, (now, seen) in last.items():
         closing = np.flatnonzero(~arrays["starts"][:60, world]).tolist()
         assert len(closing) == 1
         row = closing[0]
-        assert (arrays["observation"][row, world] == now.info["final_observation"][world]).all()
+        assert (arrays["observation"][row, world] == seen).all()
         assert (arrays["observation"][(row + 1) % rows, world] == now.observation[world]).all()
         assert not arrays["terminated"][row - 1, world]
         assert arrays["reward"][row - 1, world] == np.float32(now.reward[world])

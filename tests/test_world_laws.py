@@ -169,8 +169,8 @@ def test_divergence_ends_only_its_own_episode(
             for name in (
                 "reward",
                 "terminated",
-                "info.final_observation",
-                "info.final_state",
+                "observation",
+                "info.state",
                 "info.end_reason",
             ):
                 assert same(flat(calm)[name][b], flat(disturbed)[name][b]), (t, name)
@@ -249,12 +249,17 @@ def test_an_environment_refuses_to_go_on_before_its_start_and_after_its_end():
 
 def test_a_world_waits_for_its_reset_where_autoreset_is_off():
     env = make("hazard_nav-4", 3, threads=1, autoreset=False, horizon=2)
+    going_on = make("hazard_nav-4", 3, threads=1, horizon=2)
     rest = np.zeros((3, 4, 3))
-    env.reset()
-    env.step(rest)
-    last = env.step(rest)
+    for each in (env, going_on):
+        each.reset()
+        each.step(rest)
+    last, next_one = env.step(rest), going_on.step(rest)
     assert last.truncated.all()
-    assert same(last.observation, last.info["final_observation"])
+    for told in (last.info, next_one.info):
+        assert same(last.observation, told["final_observation"])
+        assert same(last.info["state"], told["final_state"])
+        assert same(env.rows, told["final_rows"])
     assert same(last.info["episode_id"], np.arange(3))
     with pytest.raises(hipg_bench.errors.HipgError, match="env 0 is waiting for reset"):
         env.step(rest)

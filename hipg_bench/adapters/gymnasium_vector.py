@@ -125,14 +125,14 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _last(self, step: Step, info: dict[str, Any], done: Bool[np.ndarray, "B"]) -> dict[str, Any]:
         """What Gymnasium's own vector environments tell when episodes end: their last, then their next."""
         final = self._flat(step.info["final_observation"])
-        seen = np.full(self.num_envs, None, object)
-        seen[done] = np.fromiter(final[done], object, int(done.sum()))
-        last = {**info, "state": step.info["final_state"], "alive": step.info["final_alive"]}
+        seen, state = np.full(self.num_envs, None, object), info["state"].copy()
+        seen[done], state[done] = np.fromiter(final, object, len(final)), step.info["final_state"]
+        last = {**info, "state": state, "alive": step.info["final_alive"]}
         begun = {name: np.where(done, 0.0, term) for name, term in info.items() if term.ndim == 1}
         return begun | _masked({"final_obs": seen, "final_info": _masked(last, done)}, done)
 
-    def _flat(self, observation: Float[np.ndarray, "B N O"]) -> Float[np.ndarray, "B NO"]:
-        return observation.reshape(self.num_envs, -1)
+    def _flat(self, observation: Float[np.ndarray, "n N O"]) -> Float[np.ndarray, "n NO"]:
+        return observation.reshape(len(observation), -1)
 
 
 def _masked(info: dict[str, Any], has: Bool[np.ndarray, "B"]) -> dict[str, Any]:

@@ -110,17 +110,10 @@ class Particles(abc.ABC, Generic[S]):
         if not alive.all():
             np.copyto(sim.velocity, 0.0, where=np.repeat(~alive, 2, axis=1))
         sim.control[:] = action.reshape(len(action), -1)
-        force = np.empty(was.position.shape)
         plane.push_apart(
-            was.position,
-            was.closest,
-            alive,
-            2 * self.radius,
-            law.contact_stiffness,
-            law.contact_margin,
-            force,
-        )
-        sim.applied[:] = self._factor * force.reshape(len(action), -1)
+            was.position, was.closest, alive, 2 * self.radius, law.contact_stiffness, law.contact_margin,
+            self._factor, sim.applied,
+        )  # fmt: skip
 
     def renew(self, sim: Sim, now: S, ids: Int[np.ndarray, "n"], fresh: S) -> S:
         """Put the fresh worlds into the arrays of the others."""

@@ -28,7 +28,7 @@ def add_marker(scene: mujoco.MjSpec, name: str, kind: str) -> mujoco.MjsBody:
 
 def without_visuals(scene: mujoco.MjSpec) -> mujoco.MjSpec:
     """Drop what only a camera sees: physics runs faster without, and the state row is the same."""
-    for geom in list(scene.geoms):
-        if geom.group == VISUAL_GROUP:
-            scene.delete(geom)
+    unseen = [geom for geom in scene.geoms if geom.group == VISUAL_GROUP]
+    for thing in [*unseen, *scene.cameras, *scene.lights]:
+        scene.delete(thing)
     return scene

@@ -44,7 +44,7 @@ class Forks:
             count,
             settings.seed,
             threads=torch.get_num_threads(),
-            autoreset=False,
+            autoreset=False,  # a step's state is the one that it led to
             weights=settings.weights,
         )
         self.step: Step = self.env.reset()
@@ -64,7 +64,7 @@ class Forks:
             "reward": torch.from_numpy(now.reward).float(),
             "ended": torch.from_numpy(now.terminated if self.settings.bootstrap_truncation else over),
             "done": torch.from_numpy(due),
-            "next_state": torch.from_numpy(now.info["final_state"]),
+            "next_state": torch.from_numpy(now.info["state"]),
         })  # fmt: skip
         self.step = now
         if due.any():

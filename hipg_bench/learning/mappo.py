@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from safetensors.numpy import load_file
 from safetensors.torch import save_file
 from torch import Tensor
@@ -24,7 +24,7 @@ from torch import Tensor
 from hipg_bench.env import BatchEnv, Step
 from hipg_bench.errors import BundleError
 from hipg_bench.layout import TaskLayout
-from hipg_bench.learning import credit
+from hipg_bench.learning import credit, losses
 from hipg_bench.learning.forks import Forks
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
@@ -45,21 +45,30 @@ _LOSE_EVERY = 5
 
 @dataclasses.dataclass
 class Rollout:
-    """T steps of B worlds, and where they led."""
+    """T steps of B worlds. Of what is seen, the row after the last is what they led to."""
 
-    observation: Float[Tensor, "T B N O"]
-    state: Float[Tensor, "T B S"]
-    elapsed: Float[Tensor, "T B"]  # share of the horizon
     health: Float[Tensor, "T B N"]
     action: Float[Tensor, "T B N A"]
     log_prob: Float[Tensor, "T B N"]
     reward: Float[Tensor, "T B"]
     terminated: Bool[Tensor, "T B"]
     done: Bool[Tensor, "T B"]
-    next_observation: Float[Tensor, "T B N O"]  # what the step led to, before any autoreset
-    next_state: Float[Tensor, "T B S"]
-    next_elapsed: Float[Tensor, "T B"]
+    observation: Float[Tensor, "T+1 B N O"]
+    state: Float[Tensor, "T+1 B S"]
+    elapsed: Float[Tensor, "T+1 B"]  # share of the horizon
+    ends: list[End]  # where the next row is not what a step led to
     episodes: list[dict[str, float]]  # metrics of those that ended
+
+
+@dataclasses.dataclass
+class End:
+    """What the t-th step led to in M worlds whose episode it ended."""
+
+    t: int
+    world: Int[Tensor, "M"]
+    observation: Float[Tensor, "M N O"]
+    state: Float[Tensor, "M S"]
+    elapsed: Float[Tensor, "M"]
 
 
 class Trainer:
@@ -101,29 +110,23 @@ class Trainer:
         settings, env = self.settings, self.env
         T, B, N = settings.rollout, env.num_envs, env.num_agents  # noqa: N806
         data = Rollout(
-            observation=torch.empty(T, B, N, env.observation_size),
-            state=torch.empty(T, B, env.state_size),
-            elapsed=torch.empty(T, B),
             health=torch.empty(T, B, N),
             action=torch.empty(T, B, N, env.action_size),
             log_prob=torch.empty(T, B, N),
             reward=torch.empty(T, B),
             terminated=torch.empty(T, B, dtype=torch.bool),
             done=torch.empty(T, B, dtype=torch.bool),
-            next_observation=torch.empty(T, B, N, env.observation_size),
-            next_state=torch.empty(T, B, env.state_size),
-            next_elapsed=torch.empty(T, B),
+            observation=torch.empty(T + 1, B, N, env.observation_size),
+            state=torch.empty(T + 1, B, env.state_size),
+            elapsed=torch.empty(T + 1, B),
+            ends=[],
             episodes=[],
         )
         for t in range(T):
-            lost = self._lose_some() if settings.spontaneous_deaths and t % _LOSE_EVERY == 0 else None
-            if lost is not None and t > 0:
-                data.done[t - 1] |= lost  # what was learned before must not pay for it
-            was = self.step
-            data.observation[t] = torch.from_numpy(was.observation)
-            data.state[t] = torch.from_numpy(was.info["state"])
-            data.elapsed[t] = torch.from_numpy(was.info["elapsed"]) / env.spec.horizon
-            data.health[t] = torch.from_numpy(was.info["health"])
+            self._look(data, t)
+            if settings.spontaneous_deaths and t % _LOSE_EVERY == 0:
+                self._lose_some(data, t)
+            data.health[t] = torch.from_numpy(self.step.info["health"])
             policy = self.actor(data.observation[t])
             data.action[t] = policy.sample()
             data.log_prob[t] = policy.log_prob(data.action[t]).sum(-1)
@@ -135,17 +138,33 @@ class Trainer:
             data.reward[t] = torch.from_numpy(now.reward)
             data.terminated[t] = torch.from_numpy(now.terminated)
             data.done[t] = torch.from_numpy(now.terminated | now.truncated)
-            data.next_observation[t] = torch.from_numpy(now.info["final_observation"])
-            data.next_state[t] = torch.from_numpy(now.info["final_state"])
-            data.next_elapsed[t] = data.elapsed[t] + 1 / env.spec.horizon
-            for b in np.flatnonzero(data.done[t].numpy()):
-                data.episodes.append({name: float(values[b]) for name, values in now.info["metrics"].items()})
+            if data.done[t].any():
+                self._note_end(data, t)
+        self._look(data, T)
         return data
 
-    def _lose_some(self) -> Bool[Tensor, "B"]:
-        """Kill agents without a cause; returns the worlds in which it happened.
+    def _look(self, data: Rollout, t: int) -> None:
+        """Write what is seen now."""
+        now = self.step
+        data.observation[t] = torch.from_numpy(now.observation)
+        data.state[t] = torch.from_numpy(now.info["state"])
+        data.elapsed[t] = torch.from_numpy(now.info["elapsed"]) / self.env.spec.horizon
 
-        The critic is asked about teams without agent i; this way it has met such teams.
+    def _note_end(self, data: Rollout, t: int) -> None:
+        """Write what was last seen of episodes that the t-th step ended, and their metrics."""
+        (over,), info = data.done[t].nonzero(as_tuple=True), self.step.info
+        observation, state = (
+            torch.from_numpy(info["final_observation"]),
+            torch.from_numpy(info["final_state"]),
+        )
+        data.ends.append(End(t, over, observation, state, data.elapsed[t, over] + 1 / self.env.spec.horizon))
+        for b in over.tolist():
+            data.episodes.append({name: float(values[b]) for name, values in info["metrics"].items()})
+
+    def _lose_some(self, data: Rollout, t: int) -> None:
+        """Kill agents without a cause: the critic is asked about teams without agent i, and so meets such.
+
+        What was learned before must not pay for it: the episode ends there, and another goes on.
         """
         env = self.env
         chance = self.settings.spontaneous_deaths * _LOSE_EVERY / (env.spec.horizon * env.num_agents)
@@ -157,7 +176,12 @@ class Trainer:
                 chosen = struck[:, agent].numpy()
                 rows[chosen] = env.fork(rows[chosen], {agent: 0.0})
             self.step = env.load_rows(worlds, rows[worlds])
-        return struck.any(1)
+        if t > 0:
+            (cut,) = (struck.any(1) & ~data.done[t - 1]).nonzero(as_tuple=True)
+            seen = data.observation[t, cut], data.state[t, cut], data.elapsed[t, cut]
+            data.ends.append(End(t - 1, cut, *seen))
+            data.done[t - 1, cut] = True
+        self._look(data, t)
 
     @torch.no_grad()
     def assign_credit(self, data: Rollout) -> tuple[Float[Tensor, "T B K"], Float[Tensor, "T B N"]]:
@@ -167,11 +191,13 @@ class Trainer:
         the rollout on the way.
         """
         settings = self.settings
-        self.actor.norm.update(data.observation[data.health > 0])
-        seen, elapsed = self._shown(data.observation, data.state, data.elapsed)
-        self.critic.norm.update(seen.flatten(0, -2))
-        value = self.critic(seen, elapsed)
-        next_value = self.critic(*self._shown(data.next_observation, data.next_state, data.next_elapsed))
+        self.actor.norm.update(data.observation[:-1][data.health > 0])
+        seen, elapsed = self._shown(data)
+        self.critic.norm.update(seen[:-1].flatten(0, -2))
+        values = self.critic(seen, elapsed)
+        value, next_value = values[:-1], values[1:].clone()
+        for end in data.ends:
+            next_value[end.t, end.world] = self.critic(*self._shown(end))
         ended = data.terminated if settings.bootstrap_truncation else data.done
         target = value + gae(
             data.reward[..., None], value, next_value, ended[..., None], data.done[..., None],
@@ -190,21 +216,18 @@ class Trainer:
         self.critic.returns.update(target.flatten()[:, None])
         return target, psi.view_as(data.health)
 
-    def _shown(
-        self,
-        observation: Float[Tensor, "T B N O"],
-        state: Float[Tensor, "T B S"],
-        elapsed: Float[Tensor, "T B"],
-    ) -> tuple[Float[Tensor, "T B K F"], Float[Tensor, "T B K"]]:
+    def _shown(self, view: Rollout | End) -> tuple[Float[Tensor, "*T B K F"], Float[Tensor, "*T B K"]]:
         """What the arm's critic is shown: the joint state, or every agent's own observation."""
-        seen = observation if self.settings.arm == "local" else state[:, :, None]
-        return seen, elapsed[..., None].expand(seen.shape[:-1])
+        seen = view.observation if self.settings.arm == "local" else view.state[..., None, :]
+        return seen, view.elapsed[..., None].expand(seen.shape[:-1])
 
     def _value_without_each(self, data: Rollout) -> Float[Tensor, "TB N"]:
         """V(s with only h_i := 0) for every agent i."""
         layout = self.env.layout
         values: list[Tensor] = []
-        for state, elapsed in zip(data.state, data.elapsed, strict=True):  # a step at a time, to bound memory
+        for state, elapsed in zip(
+            data.state[:-1], data.elapsed[:-1], strict=True
+        ):  # by steps, to bound memory
             copies = credit.with_each_dead(state, layout.health_columns, layout.dead_value)
             values.append(self.critic(copies, elapsed[:, None].expand(copies.shape[:2])))
         return torch.cat(values)
@@ -220,7 +243,7 @@ class Trainer:
         settings = self.settings
         used = data.health > 0 if settings.mask_dead else torch.ones_like(data.health, dtype=torch.bool)
         with torch.no_grad():
-            observation = self.actor.norm(data.observation[used])
+            observation = self.actor.norm(data.observation[:-1][used])
         action, log_prob, weight = data.action[used], data.log_prob[used], psi[used]
         divergence = entropy = 0.0
         for _ in range(settings.epochs):
@@ -234,7 +257,7 @@ class Trainer:
                     policy = self.actor.distribution(observation.index_select(0, piece))
                     change = policy.log_prob(action[piece]).sum(-1) - log_prob[piece]
                     spread = policy.entropy().sum(-1).mean()
-                    loss = -surrogate(change, psi_of, settings.clip) - settings.entropy * spread
+                    loss = -losses.surrogate(change, psi_of, settings.clip) - settings.entropy * spread
                     (loss * (len(piece) / len(part))).backward()
                     # k3 estimator of KL(old, new): unbiased and never negative
                     divergence += float((change.exp() - 1 - change).sum().detach()) / len(weight)
@@ -255,9 +278,9 @@ class Trainer:
     def _update_critic(self, data: Rollout, target: Float[Tensor, "T B K"]) -> dict[str, float]:
         """Descend the squared error of normalised values (eqn:value_update)."""
         settings, returns = self.settings, self.critic.returns
-        seen, elapsed = self._shown(data.observation, data.state, data.elapsed)
+        seen, elapsed = self._shown(data)
         with torch.no_grad():
-            inputs = self.critic.inputs(seen, elapsed).flatten(0, -2)
+            inputs = self.critic.inputs(seen[:-1], elapsed[:-1]).flatten(0, -2)
             aim = (target.flatten() - returns.offset) / returns.scale
             if self.forks is not None:
                 state, when, value = self.forks.harvest(self.critic)
@@ -271,7 +294,7 @@ class Trainer:
             error = 0.0
             for part in parts:
                 value = self.critic.normalized(inputs.index_select(0, part))
-                loss = value_loss(value, before[part], aim[part], reach)
+                loss = losses.value_loss(value, before[part], aim[part], reach)
                 self.critic_optimizer.zero_grad()
                 loss.backward()
                 _step(self.critic_optimizer, settings.max_grad_norm)
@@ -361,36 +384,6 @@ def networks(settings: Settings, layout: TaskLayout) -> tuple[Actor, Critic]:
         normalize_returns=settings.normalize_returns,
     )
     return actor, critic
-
-
-def surrogate(change: Float[Tensor, "X"], psi: Float[Tensor, "X"], clip: float) -> Float[Tensor, ""]:
-    """PPO's clipped surrogate, to be ascended (eqn:surrogate_objective_clipped without the bonus).
-
-    Args:
-        change: log of the ratio of new to old probability.
-        psi: weight of each sample.
-        clip: epsilon.
-    """
-    ratio = change.exp()
-    return torch.minimum(ratio * psi, ratio.clamp(1 - clip, 1 + clip) * psi).mean()
-
-
-def value_loss(
-    value: Float[Tensor, "X"], before: Float[Tensor, "X"], aim: Float[Tensor, "X"], reach: float | None
-) -> Float[Tensor, ""]:
-    """Mean squared error of values, of which no sample gains by moving further than ``reach``.
-
-    Args:
-        value: as the critic says now.
-        before: as it said before the update.
-        aim: value targets, all three in the same units.
-        reach: None does not clip.
-    """
-    error = (value - aim).square()
-    if reach is not None:
-        clipped = before + (value - before).clamp(-reach, reach)
-        error = torch.maximum(error, (clipped - aim).square())
-    return error.mean()
 
 
 def _step(optimizer: torch.optim.Optimizer, max_norm: float) -> None:

@@ -72,23 +72,25 @@ class Replay:
         """Write what the worlds show at first."""
         self._show(view, self._worlds)
 
-    def add(self, outcome: Arrays, led_to: Arrays, done: Bool[np.ndarray, "B"], view: Arrays) -> None:
+    def add(self, outcome: Arrays, view: Arrays, done: Bool[np.ndarray, "B"], last: Arrays) -> None:
         """Write a step of all worlds.
 
         Args:
             outcome: what was done about the latest view, and what came of it.
-            led_to: the view that the step led to.
+            view: what the worlds show now: what the step led to, or the next episode's first view.
             done: the step ended the episode.
-            view: what the worlds show now: ``led_to``, or the next episode's first view.
+            last: what it led to where it did, only of those worlds.
         """
         for name, values in outcome.items():
             self._arrays[name][self._place, self._worlds] = values
         self._arrays["starts"][self._place, self._worlds] = True
         self._advance(self._worlds)
-        self._show(led_to, self._worlds)
+        self._show(view, self._worlds)
         over = np.flatnonzero(done)
-        self._advance(over)
-        self._show(view, over)
+        if len(over):
+            self._show(last, over)
+            self._advance(over)
+            self._show({name: view[name][over] for name in self._views}, over)
 
     def sample(self, n: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Draw n steps evenly, with torch's random numbers: views with outcomes, and views they led to."""
@@ -125,7 +127,7 @@ class Replay:
     def _show(self, view: Arrays, worlds: Int[np.ndarray, "n"]) -> None:
         place = self._place[worlds]
         for name in self._views:
-            self._arrays[name][place, worlds] = view[name][worlds]
+            self._arrays[name][place, worlds] = view[name]
         self._arrays["starts"][place, worlds] = False
 
     def _check_space(self, folder: Path, num_envs: int, examples: Arrays) -> None:
@@ -247,13 +249,13 @@ class ReplayTrainer(abc.ABC):
                 "reward": now.reward,
                 "terminated": now.terminated,
             },
+            _view(now),
+            done,
             {
                 "observation": now.info["final_observation"],
                 "state": now.info["final_state"],
-                "alive": now.info["final_alive"],
+                "alive": now.info["final_alive"][done],
             },
-            done,
-            _view(now),
         )
         return {name: values[done] for name, values in now.info["metrics"].items()}
 

@@ -108,7 +108,8 @@ def push_apart(
     reach: float,
     stiffness: float,
     margin: float,
-    force: Float[np.ndarray, "B N 2"],
+    scale: float,
+    force: Float[np.ndarray, "B C"],
 ) -> None:
     """Soft contact force on each agent: ``stiffness * margin * softplus((reach - d) / margin)``, N.
 
@@ -122,7 +123,8 @@ def push_apart(
         reach: sum of two radii, m.
         stiffness: N/m deep inside the contact.
         margin: depth over which the contact sets in, m.
-        force: written into.
+        scale: by which the sum over an agent's contacts is multiplied.
+        force: written into, along the coordinates of one agent after another.
     """
     force[:] = 0.0
     worlds, agents, _ = position.shape
@@ -141,8 +143,10 @@ def push_apart(
                     for axis in range(2):
                         along = (position[world, j, axis] - position[world, i, axis]) / distance
                         push = along * (stiffness * margin * softplus)
-                        force[world, i, axis] -= push
-                        force[world, j, axis] += push
+                        force[world, 2 * i + axis] -= push
+                        force[world, 2 * j + axis] += push
+        for k in range(2 * agents):
+            force[world, k] *= scale
 
 
 @compiled

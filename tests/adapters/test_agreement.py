@@ -45,8 +45,8 @@ def check(dead, moment):
     seen, step = moment.seen, moment.step
     reported = moment.lived if dead == "remove" else np.ones_like(moment.lived)
     np.testing.assert_array_equal(seen.reported, reported)
-    assert bits(seen.observation[reported]) == bits(step.info["final_observation"][0][reported])
-    assert seen.state is None or bits(seen.state) == bits(step.info["final_state"][0])
+    assert bits(seen.observation[reported]) == bits(step.observation[0][reported])
+    assert seen.state is None or bits(seen.state) == bits(step.info["state"][0])
     np.testing.assert_array_equal(seen.alive, moment.alive)
     paid = moment.lived if dead == "ghost" else reported
     # some libraries keep rewards in float32

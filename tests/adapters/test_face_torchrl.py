@@ -62,10 +62,10 @@ def test_worlds_agree_with_the_batch_bit_for_bit_through_deaths_and_restarts():
         lost = ~alive.any(axis=1)
         terminated, done = step.terminated | lost, step.terminated | step.truncated | lost
         expected = {
-            ("agents", "observation"): step.info["final_observation"],
+            ("agents", "observation"): step.observation,
             ("agents", "alive"): alive[..., None],
             ("agents", "reward"): np.where(lived, step.reward[:, None], 0.0)[..., None].astype(np.float32),
-            "state": step.info["final_state"],
+            "state": step.info["state"],
             "done": done[:, None],
             "terminated": terminated[:, None],
             "truncated": (step.truncated & ~lost)[:, None],
