@@ -153,11 +153,8 @@ class Trainer:
     def _note_end(self, data: Rollout, t: int) -> None:
         """Write what was last seen of episodes that the t-th step ended, and their metrics."""
         (over,), info = data.done[t].nonzero(as_tuple=True), self.step.info
-        observation, state = (
-            torch.from_numpy(info["final_observation"]),
-            torch.from_numpy(info["final_state"]),
-        )
-        data.ends.append(End(t, over, observation, state, data.elapsed[t, over] + 1 / self.env.spec.horizon))
+        seen = torch.from_numpy(info["final_observation"]), torch.from_numpy(info["final_state"])
+        data.ends.append(End(t, over, *seen, data.elapsed[t, over] + 1 / self.env.spec.horizon))
         for b in over.tolist():
             data.episodes.append({name: float(values[b]) for name, values in info["metrics"].items()})
 
