@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from hipg_bench.cli import app
 from hipg_bench.comparison import artefacts
 from hipg_bench.comparison.cards import readme
+from hipg_bench.errors import BundleError
 from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.learning import audit, sweep
 from hipg_bench.learning.run import train
@@ -174,3 +175,20 @@ def test_the_command(trained, tmp_path: Path) -> None:
     assert "1 are unfinished" in done.stdout
     rows = list(csv.DictReader((tmp_path / "mappo_minhealth" / TASK / "seed1.curve.csv").open()))
     assert [row["steps"] for row in rows] == ["20", "40"]
+
+
+def test_a_bundle_holds_what_its_run_began_with(trained, agents: Path, tmp_path: Path) -> None:
+    begun = tmp_path / "begun.safetensors"
+    shutil.copy(agents / "mappo_minhealth" / TASK / "seed1.safetensors", begun)
+    text = SWEEP.split("[[run]]")[1].replace("actor_hidden", f'start = "{begun}", actor_hidden')
+    (tmp_path / "sweep.toml").write_text("[[run]]" + text.replace("[0, 1, 2]", "[1]"))
+    (run,) = sweep.load(tmp_path / "sweep.toml", tmp_path / "runs")
+    train(run.settings, run.out, command=run.command)
+    list(artefacts.collect([run], tmp_path / "agents", plan=FEW))
+    place = tmp_path / "agents" / "mappo_minhealth" / TASK
+    assert (place / "seed1.start.safetensors").read_bytes() == begun.read_bytes()
+    assert load_agent(place.parent).train_seeds(TASK) == (1,)
+    begun.write_bytes((place / "seed1.safetensors").read_bytes())
+    with pytest.raises(BundleError, match="gone or has changed"):
+        list(artefacts.collect([run], tmp_path / "others", plan=FEW))
+    assert not (tmp_path / "others" / "mappo_minhealth" / TASK / "seed1.safetensors").exists()

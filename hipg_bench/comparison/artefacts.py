@@ -6,12 +6,14 @@ A run with seed k of an arm on a task comes to lie in ``<agents>/<bundle>/<task>
     seed<k>.json                 the run's record, and its score by the standard protocol
     seed<k>.curve.csv            raw rows of the learning curve, at most `MOST_ROWS`
     seed<k>.learner.safetensors  the networks an audit needs; of seed 0 only, to bound the size
+    seed<k>.start.safetensors    the policy that the run began with, if it began with one
 """
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import hashlib
 import io
 import json
 import shutil
@@ -142,10 +144,21 @@ def _add(run: Run, folder: Path, plan: Plan) -> None:
         + "\n",
     )
     write_text(place.with_suffix(".curve.csv"), _thinned_text((run.out / "curve.csv").read_text()))
+    if "start_fingerprint" in record:
+        _copy(_start(run, record), place.with_suffix(".start.safetensors"))
     learner = run.out / "learner.safetensors"
     if settings.seed == 0 and learner.exists():
         _copy(learner, place.with_suffix(".learner.safetensors"))
     _copy(policy, place.with_suffix(".safetensors"))
+
+
+def _start(run: Run, record: dict[str, Any]) -> Path:
+    """The policy that a run began with, without which nobody can repeat it."""
+    path = Path(record["settings"]["start"])
+    fingerprint = hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
+    if not fingerprint.startswith(record["start_fingerprint"]):
+        raise BundleError(f"{run.out} began with {path}, which is gone or has changed since")
+    return path
 
 
 def result(task: str, rows: Sequence[Row]) -> dict[str, Any]:
