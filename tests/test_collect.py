@@ -188,6 +188,7 @@ def test_a_bundle_holds_what_its_run_began_with(trained, agents: Path, tmp_path:
     place = tmp_path / "agents" / "mappo_minhealth" / TASK
     assert (place / "seed1.start.safetensors").read_bytes() == begun.read_bytes()
     assert load_agent(place.parent).train_seeds(TASK) == (1,)
+    assert f'start="{TASK}/seedK.start.safetensors"' in (place.parent / "README.md").read_text()
     begun.write_bytes((place / "seed1.safetensors").read_bytes())
     with pytest.raises(BundleError, match="gone or has changed"):
         list(artefacts.collect([run], tmp_path / "others", plan=FEW))

@@ -60,6 +60,7 @@ def _section(task: str, records: dict[int, dict[str, Any]]) -> list[str]:
     first = next(iter(records.values()))
     command = re.sub(r"--seed \d+", "--seed K", first["command"])
     command = re.sub(r"--out \S+", "--out DIR", command)
+    command = re.sub(r'start="[^"]*"', f'start="{task}/seedK.start.safetensors"', command)
     return [
         f"## {task}",
         f"{mean}Trained with `{command}`.",
