@@ -27,7 +27,7 @@ def add_marker(scene: mujoco.MjSpec, name: str, kind: str) -> mujoco.MjsBody:
 
 
 def without_visuals(scene: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Drop what only a camera sees: physics runs faster without, and the state row is the same."""
+    """Drop cameras and what only they see: physics runs faster without, and the state row is the same."""
     unseen = [geom for geom in scene.geoms if geom.group == VISUAL_GROUP]
     for thing in [*unseen, *scene.cameras, *scene.lights]:
         scene.delete(thing)
