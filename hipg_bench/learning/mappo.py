@@ -167,12 +167,13 @@ class Trainer:
         chance = self.settings.spontaneous_deaths * _LOSE_EVERY / (env.spec.horizon * env.num_agents)
         struck = torch.rand(env.num_envs, env.num_agents) < chance
         worlds = torch.nonzero(struck.any(1))[:, 0].numpy()
-        if len(worlds):
-            rows = env.rows
-            for agent in range(env.num_agents):
-                chosen = struck[:, agent].numpy()
-                rows[chosen] = env.fork(rows[chosen], {agent: 0.0})
-            self.step = env.load_rows(worlds, rows[worlds])
+        if not len(worlds):
+            return
+        rows = env.rows
+        for agent in range(env.num_agents):
+            chosen = struck[:, agent].numpy()
+            rows[chosen] = env.fork(rows[chosen], {agent: 0.0})
+        self.step = env.load_rows(worlds, rows[worlds])
         if t > 0:
             (cut,) = (struck.any(1) & ~data.done[t - 1]).nonzero(as_tuple=True)
             seen = data.observation[t, cut], data.state[t, cut], data.elapsed[t, cut]
