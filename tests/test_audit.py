@@ -15,7 +15,8 @@ from hipg_bench import make
 from hipg_bench.cli import app
 from hipg_bench.errors import HipgError, SpecError
 from hipg_bench.learning import audit
-from hipg_bench.learning.mappo import networks
+from hipg_bench.learning.leverage import leverage
+from hipg_bench.learning.mappo import Trainer, networks
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import Settings, recommended
 
@@ -111,6 +112,9 @@ def test_the_command_prints_what_it_found_and_draws_it(tmp_path: Path) -> None:
     facts = json.loads(CliRunner().invoke(app, ["audit", "--run", str(tmp_path), *size, "--json"]).stdout)
     found = audit.audit(*audit.load(tmp_path), worlds=4, moments=2, repeats=2)
     assert facts["credit"]["bias"] == pytest.approx(found.credit.bias, abs=1e-6)
+    assert facts["gradient"]["episodes"] == 8 * 4
+    assert facts["gradient"]["noise"]["central"] == 1.0
+    assert "V(s)'s noise" in done.stdout
 
 
 def test_a_bundle_is_audited_as_its_run(tmp_path: Path) -> None:
@@ -148,3 +152,47 @@ def test_a_critic_of_each_ones_own_cannot_be_asked(tmp_path: Path) -> None:
     train(recommended("coop_nav-3", arm="local", **SMALL), tmp_path, command="test")
     with pytest.raises(HipgError, match="local critic"):
         audit.load(tmp_path / "learner.safetensors")
+
+
+def test_the_gradients_noise_is_that_of_a_plain_loop() -> None:
+    """Without a baseline the weight is the target minus its mean: the covariance's trace, by NumPy."""
+    settings = recommended("hazard_nav-4", actor_hidden=(8,), attends=(), critic_hidden=(8,))
+    torch.manual_seed(1)
+    actor, critic = networks(settings, make(settings.task).layout)
+    found = leverage(actor, critic, settings, worlds=6, seed=500)
+
+    trainer = Trainer(settings.model_copy(update={"num_envs": 6, "rollout": 50, "seed": 500}))
+    trainer.actor.load_state_dict(actor.state_dict())
+    trainer.critic.load_state_dict(critic.state_dict())
+    data = trainer.roll_out()
+    with torch.no_grad():
+        value, target = trainer.value_targets(data)
+    live = data.health > 0
+    traces = []
+    for baseline in (torch.zeros_like(value), value):
+        psi = (target - baseline).expand(live.shape)
+        mean, gradients = float(psi[live].mean()), []
+        for b in range(6):
+            trainer.actor.zero_grad()
+            for t in range(50):
+                for i in range(4):
+                    if live[t, b, i]:
+                        policy = trainer.actor(data.observation[t, b, i])
+                        weight = data.health[t, b, i] * float(target[t, b, 0] - baseline[t, b, 0]) - mean
+                        (weight * policy.log_prob(data.action[t, b, i]).sum()).backward()
+            gradients.append(torch.cat([p.grad.flatten() for p in trainer.actor.parameters()]).numpy())
+        traces.append(np.trace(np.cov(np.array(gradients, np.float64).T)))
+    assert found.noise["none"] == pytest.approx(traces[0] / traces[1], rel=1e-3)
+
+
+def test_a_baseline_that_says_the_same_of_all_states_changes_nothing() -> None:
+    settings = recommended("coop_nav-3", actor_hidden=(8,), critic_hidden=(8,))
+    actor, critic = networks(settings, make(settings.task).layout)
+    with torch.no_grad():
+        for parameter in critic.parameters():
+            parameter.zero_()
+    found = leverage(actor, critic, settings, worlds=8)
+    for name, (low, high) in found.interval.items():
+        assert found.noise[name] == pytest.approx(1.0, abs=1e-4)
+        assert low == pytest.approx(1.0, abs=1e-4)
+        assert high == pytest.approx(1.0, abs=1e-4)

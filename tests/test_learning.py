@@ -123,7 +123,7 @@ def test_min_health_baseline_is_unbiased() -> None:
     trainer = Trainer(recommended("hazard_nav-4", num_envs=64, rollout=20))
     trainer.iterate()  # values away from zero: a bias would show
     data = trainer.roll_out()
-    baseline = trainer._value_without_each(data).view_as(data.health)
+    baseline = trainer.value_without_each(data).view_as(data.health)
     mean = trainer.actor(data.observation[:-1]).mean
     # grad of log N(a; mu, sigma) with respect to mu is (a - mu) / sigma^2, sampled from the policy itself
     score = (data.action - mean) / trainer.actor.log_std.exp() ** 2

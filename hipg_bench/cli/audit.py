@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +13,10 @@ from hipg_bench.errors import HipgError, SpecError
 
 if TYPE_CHECKING:
     from hipg_bench.learning.audit import Audit, Comparison
+    from hipg_bench.learning.leverage import Leverage
+
+_NOISE_WORLDS = 8
+"""Episodes that the gradient's noise is measured on, per episode that states are taken from."""
 
 
 def audit(
@@ -19,7 +24,9 @@ def audit(
     agent: Annotated[str | None, typer.Option(help="a bundled agent's name or a bundle's folder,")] = None,
     task: Annotated[str | None, typer.Option(help="with the task,")] = None,
     seed: Annotated[int, typer.Option(min=0, help="and the training seed.")] = 0,
-    worlds: Annotated[int, typer.Option(min=1, help="Episodes that states are taken from.")] = 32,
+    worlds: Annotated[
+        int, typer.Option(min=1, help="Episodes that states are taken from; 8 times as many for the noise.")
+    ] = 32,
     moments: Annotated[int, typer.Option(min=1, help="States per episode.")] = 4,
     repeats: Annotated[int, typer.Option(min=2, help="Rollouts per state and dead agent.")] = 8,
     luck: Annotated[int, typer.Option(min=0, help="Seed of the episodes and of all luck.")] = 500,
@@ -31,17 +38,23 @@ def audit(
     import torch
 
     from hipg_bench.learning import audit as audits
+    from hipg_bench.learning.leverage import leverage
 
     torch.set_num_threads(threads)
     source = _source(run, agent, task, seed)
     actor, critic, settings = audits.load(source)
     found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=luck)
+    noise = leverage(actor, critic, settings, worlds=_NOISE_WORLDS * worlds, seed=luck)
     if plot is not None:
         audits.draw(found, plot, title=f"{settings.task}, {settings.arm}, seed {settings.seed}")
     if as_json:
-        console.show_json(_facts(found) | {"run": str(source), "settings": settings.model_dump()})
+        console.show_json(
+            _facts(found)
+            | {"gradient": dataclasses.asdict(noise), "run": str(source), "settings": settings.model_dump()}
+        )
         return
     _print(found, f"{settings.task}, arm {settings.arm}, training seed {settings.seed}")
+    _print_noise(noise)
 
 
 def _source(run: Path | None, agent: str | None, task: str | None, seed: int) -> Path:
@@ -89,6 +102,26 @@ def _print(found: Audit, title: str) -> None:
         f"{found.cases} pairs of a state and an agent, {found.repeats} rollouts each; "
         f"visited states: {shares}"
     )
+
+
+def _print_noise(found: Leverage) -> None:
+    rows = console.table(
+        "baseline",
+        ">noise of the gradient",
+        ">95 % interval",
+        "",
+        title="The actor's gradient, V(s)'s noise = 1",
+    )
+    for name, about in (
+        ("none", "the mean target alone"),
+        ("central", "V(s)"),
+        ("min_health", "V(s with only h_i := 0)"),
+    ):
+        low, high = found.interval[name]
+        rows.add_row(name, console.number(found.noise[name], 3), f"{low:.2f} to {high:.2f}", about)
+    console.show(rows)
+    scale = "no signal seen" if found.scale is None else f"as much noise as signal at {found.scale:,.0f}"
+    console.say(f"{found.episodes} episodes; under V(s) {scale}")
 
 
 def _facts(found: Audit) -> dict[str, object]:

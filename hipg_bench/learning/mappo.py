@@ -190,22 +190,12 @@ class Trainer:
         """
         settings = self.settings
         self.actor.norm.update(data.observation[:-1][data.health > 0])
-        seen, elapsed = self._shown(data)
-        self.critic.norm.update(seen[:-1].flatten(0, -2))
-        values = self.critic(seen, elapsed)
-        value, next_value = values[:-1], values[1:].clone()
-        for end in data.ends:
-            next_value[end.t, end.world] = self.critic(*self._shown(end))
-        ended = data.terminated if settings.bootstrap_truncation else data.done
-        target = value + gae(
-            data.reward[..., None], value, next_value, ended[..., None], data.done[..., None],
-            settings.gamma, settings.lam,
-        )  # fmt: skip
-
+        self.critic.norm.update(self._shown(data)[0][:-1].flatten(0, -2))
+        value, target = self.value_targets(data)
         masked = settings.mask_dead or settings.arm == "min_health"
         health = (data.health if masked else torch.ones_like(data.health)).flatten(0, 1)
         if settings.arm == "min_health":
-            psi = credit.min_health(target.flatten(0, 1), self._value_without_each(data), health)
+            psi = credit.min_health(target.flatten(0, 1), self.value_without_each(data), health)
         else:
             psi = credit.advantage(target.flatten(0, 1), value.flatten(0, 1), health)
         if settings.psi_over != "minibatch":
@@ -214,12 +204,25 @@ class Trainer:
         self.critic.returns.update(target.flatten()[:, None])
         return target, psi.view_as(data.health)
 
+    def value_targets(self, data: Rollout) -> tuple[Float[Tensor, "T B K"], Float[Tensor, "T B K"]]:
+        """The critic's values, and what it shall learn (eqn:value_target)."""
+        settings = self.settings
+        values = self.critic(*self._shown(data))
+        value, next_value = values[:-1], values[1:].clone()
+        for end in data.ends:
+            next_value[end.t, end.world] = self.critic(*self._shown(end))
+        ended = data.terminated if settings.bootstrap_truncation else data.done
+        return value, value + gae(
+            data.reward[..., None], value, next_value, ended[..., None], data.done[..., None],
+            settings.gamma, settings.lam,
+        )  # fmt: skip
+
     def _shown(self, view: Rollout | End) -> tuple[Float[Tensor, "*T B K F"], Float[Tensor, "*T B K"]]:
         """What the arm's critic is shown: the joint state, or every agent's own observation."""
         seen = view.observation if self.settings.arm == "local" else view.state[..., None, :]
         return seen, view.elapsed[..., None].expand(seen.shape[:-1])
 
-    def _value_without_each(self, data: Rollout) -> Float[Tensor, "TB N"]:
+    def value_without_each(self, data: Rollout) -> Float[Tensor, "TB N"]:
         """V(s with only h_i := 0) for every agent i."""
         layout = self.env.layout
         values: list[Tensor] = []

@@ -1,0 +1,114 @@
+"""How much a baseline can matter: the noise of the actor's gradient under each, on the same episodes.
+
+A baseline leaves the gradient's mean alone (lemma 1), however right or wrong it is; all that it can do is
+take noise away. So one that leaves a share f of another's noise is worth 1/f times as many episodes, and
+no more. That bounds what the arms ``central`` and ``min_health``, which differ by the baseline, can
+differ by at this point of the training.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hipg_bench.learning import credit
+from hipg_bench.learning.mappo import Rollout, Trainer
+from hipg_bench.learning.networks import Actor, Critic
+from hipg_bench.learning.settings import Settings
+from hipg_bench.registry import task_spec
+
+_RESAMPLES = 2000
+
+
+@dataclasses.dataclass(frozen=True)
+class Leverage:
+    """What the baselines leave of the gradient's noise.
+
+    Attributes:
+        noise: trace of the covariance over episodes of an episode's gradient, as a multiple of what the
+            baseline V(s) leaves: of "none" (the mean target alone), "central" (1 by definition),
+            "min_health" (V(s with only h_i := 0)).
+        interval: 95 % of each by bootstrap over episodes.
+        scale: episodes whose mean gradient has as much noise as signal under V(s), the gradient noise
+            scale of McCandlish et al. (2018); None where no signal is seen.
+        episodes: how many were played.
+    """
+
+    noise: dict[str, float]
+    interval: dict[str, tuple[float, float]]
+    scale: float | None
+    episodes: int
+
+
+def leverage(
+    actor: Actor, critic: Critic, settings: Settings, *, worlds: int = 256, seed: int = 500
+) -> Leverage:
+    """Compare baselines on whole episodes of a policy as it explores.
+
+    Args:
+        actor: the policy.
+        critic: of the joint state.
+        settings: of the run, as `hipg_bench.learning.audit.load` gives them.
+        worlds: episodes.
+        seed: of the episodes and of all luck.
+    """
+    whole = {"rollout": task_spec(settings.task).horizon, "num_envs": worlds, "seed": seed}
+    trainer = Trainer(settings.model_copy(update={**whole, "forks": 0.0, "spontaneous_deaths": 0.0}))
+    trainer.actor.load_state_dict(actor.state_dict())
+    trainer.critic.load_state_dict(critic.state_dict())
+    data = trainer.roll_out()
+    gradients = _gradients(trainer.actor, data, _weights(trainer, data))
+
+    distance = {
+        name: (each - each.mean(0)).square().sum(1).double().numpy() for name, each in gradients.items()
+    }
+    central, mean = gradients["central"], gradients["central"].mean(0)
+    noise = float(distance["central"].sum()) / (worlds - 1)
+    signal = float(mean.square().sum()) - noise / worlds
+    drawn = np.random.default_rng(seed).integers(worlds, size=(_RESAMPLES, worlds))
+    base = distance["central"][drawn].sum(1)
+    return Leverage(
+        noise={name: float(each.sum() / distance["central"].sum()) for name, each in distance.items()},
+        interval={
+            name: tuple(np.quantile(each[drawn].sum(1) / base, [0.025, 0.975]).tolist())
+            for name, each in distance.items()
+        },
+        scale=noise / signal if signal > 0 else None,
+        episodes=len(central),
+    )
+
+
+@torch.no_grad()
+def _weights(trainer: Trainer, data: Rollout) -> dict[str, Float[Tensor, "T B N"]]:
+    """Psi under each baseline, in units of reward, with zero mean over the live samples."""
+    value, target = trainer.value_targets(data)
+    health = data.health.flatten(0, 1)
+    target = target.flatten(0, 1)
+    psi = {
+        "none": credit.advantage(target, torch.zeros_like(target), health),
+        "central": credit.advantage(target, value.flatten(0, 1), health),
+        "min_health": credit.min_health(target, trainer.value_without_each(data), health),
+    }
+    live = health > 0
+    return {
+        name: torch.where(live, each - each[live].mean(), 0.0).view_as(data.health)
+        for name, each in psi.items()
+    }
+
+
+def _gradients(
+    actor: Actor, data: Rollout, psi: dict[str, Float[Tensor, "T B N"]]
+) -> dict[str, Float[Tensor, "B P"]]:
+    """Every episode's gradient of sum_t,i Psi_i log pi(a_i | o_i), by baseline."""
+    parameters = list(actor.parameters())
+    rows: dict[str, list[Tensor]] = {name: [] for name in psi}
+    for b in range(data.health.shape[1]):
+        log_prob = actor(data.observation[:-1, b]).log_prob(data.action[:, b]).sum(-1)
+        for name, weight in psi.items():
+            parts = torch.autograd.grad((weight[:, b] * log_prob).sum(), parameters, retain_graph=True)
+            rows[name].append(torch.cat([part.flatten() for part in parts]))
+    return {name: torch.stack(each) for name, each in rows.items()}
