@@ -101,11 +101,11 @@ def test_what_was_built_in_is_found() -> None:
     judged = claims.judge_all(campaign("paper", level))
     for words in ("min-health is above central", "central is above local", "local is above MADDPG"):
         one = named(judged, words)
-        assert one.verdict == ("holds" if "without" not in one.claim else "no runs")
+        assert one.verdict == ("holds" if "without" not in one.claim else "too few runs")
         assert one.runs == (24, 24)
     assert named(judged, "lead over central grows").verdict == "undecided"
-    assert named(judged, "QMIX").verdict == "no runs"
-    assert {one.verdict for one in judged if one.suite == "standard"} == {"no runs"}
+    assert named(judged, "QMIX").verdict == "too few runs"
+    assert {one.verdict for one in judged if one.suite == "standard"} == {"too few runs"}
     backwards = claims.judge_all(campaign("paper", {"min_health": 0.5, "central": 0.7}))
     assert named(backwards, "min-health is above central").verdict == "does not hold"
 
@@ -245,7 +245,7 @@ def test_figures_and_page(agents: Path, tmp_path: Path) -> None:
     verdicts = json.loads((out / "verdicts.json").read_text())
     first = next(one for one in verdicts if one["claim"] == "min-health is above central")
     assert (first["verdict"], first["p_improvement"], first["runs"]) == ("holds", 1.0, [4, 4])
-    assert sum(one["verdict"] == "no runs" for one in verdicts) > 10
+    assert sum(one["verdict"] == "too few runs" for one in verdicts) > 10
     content = (tmp_path / "page.md").read_text()
     assert content.startswith("# Mine\n\nbefore\n")
     assert content.endswith("\nafter\n")

@@ -41,7 +41,7 @@ def test_from_training_to_figures(folder: Path) -> None:
     runs = {(one["claim"], one["suite"]): one["runs"] for one in verdicts}
     assert runs["min-health is above central", "standard"] == [2, 2]
     # two runs against two cannot decide anything: p is 1/3 at least
-    assert {one["verdict"] for one in verdicts} == {"undecided", "no runs"}
+    assert {one["verdict"] for one in verdicts} == {"undecided", "too few runs"}
     audit = ["audit", "--agent", folder / "agents" / "mappo_central", "--task", TASK, "--json"]
     found = json.loads(call(*audit, "--worlds", 2, "--moments", 1, "--repeats", 2))
     assert found["cases"] <= 2 * 4

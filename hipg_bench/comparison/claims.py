@@ -19,7 +19,7 @@ from jaxtyping import Float
 from hipg_bench.comparison.improvement import Improvement, Stratum, improvement
 from hipg_bench.comparison.traces import Trace
 
-Verdict = Literal["holds", "does not hold", "undecided", "no runs"]
+Verdict = Literal["holds", "does not hold", "undecided", "too few runs"]
 Runs = Sequence[Trace]
 Values = Float[np.ndarray, "_"]
 
@@ -53,7 +53,7 @@ class Judged:
         strata: tasks (or pairs of tasks) that were compared.
         missing: those that had too few runs.
         runs: values of x and of y in all strata.
-        found: None where there are no runs.
+        found: None where there are too few runs.
         verdict: by the rule above.
     """
 
@@ -143,7 +143,7 @@ def _judged(claim: str, suite: str, strata: dict[str, Stratum]) -> Judged:
     missing = tuple(name for name in strata if name not in enough)
     counts = (sum(len(x) for x, _ in enough.values()), sum(len(y) for _, y in enough.values()))
     if not enough:
-        return Judged(claim, suite, (), missing, counts, None, "no runs")
+        return Judged(claim, suite, (), missing, counts, None, "too few runs")
     found = improvement(list(enough.values()))
     return Judged(claim, suite, tuple(enough), missing, counts, found, verdict(found))
 
