@@ -110,14 +110,28 @@ def test_what_was_built_in_is_found() -> None:
     assert named(backwards, "min-health is above central").verdict == "does not hold"
 
 
-def test_tasks_with_one_run_are_left_out_and_named() -> None:
+def test_tasks_with_too_few_runs_are_left_out_and_named() -> None:
     runs = [run("min_health", "paper_nav-4", seed, 0.9) for seed in range(4)]
     runs += [run("central", "paper_nav-4", seed, 0.8) for seed in range(4)]
     runs += [run("min_health", "paper_nav-8", 0, 0.9), run("central", "paper_nav-8", 0, 0.1)]
-    one = named(claims.judge_all(runs), "min-health is above central")
-    assert one.strata == ("paper_nav-4",)
-    assert "paper_nav-8" in one.missing
-    assert one.runs == (4, 4)
+    judged = claims.judge_all(runs)
+    level, apart = named(judged, "min-health is above central"), named(judged, "differ less")
+    assert level.strata == ("paper_nav-4", "paper_nav-8")
+    assert "paper_comm-10" in level.missing
+    assert level.runs == (5, 5)
+    assert apart.strata == ("paper_nav-4",), "one run has no distance from another"
+    assert "paper_nav-8" in apart.missing
+
+
+def test_one_run_of_each_arm_on_six_tasks_is_a_sign_test() -> None:
+    tasks = [*claims.STANDARD, *claims.WALKERS]
+    runs = [run(arm, task, 0, level) for task in tasks for arm, level in (("central", 0.9), ("local", 0.5))]
+    one = named(claims.judge_all(runs), "central is above local", suite="standard")
+    assert one.found is not None
+    assert one.found.chance == pytest.approx(2 / 2**6, abs=0.01)  # all six fall the same way, either way
+    assert one.verdict == "holds"
+    five = named(claims.judge_all(runs[:-2]), "central is above local", suite="standard")
+    assert five.verdict == "undecided"  # 2 / 2**5 is above 0.05
 
 
 def test_a_lead_that_grows_with_the_team() -> None:

@@ -3,8 +3,9 @@
 A claim says that values x are above values y: final scores of two arms, their deviations from the median,
 gains over a part of the training. It **holds** if the 95 % interval of P(improvement) lies above 1/2 and the
 permutation test is below 0.05; it **does not hold** if the interval lies below 1/2 and the test is below
-0.05; else it is **undecided**. Tasks where one side has fewer than two runs are left out. There is no
-correction for the number of claims: about one in twenty would pass by luck.
+0.05; else it is **undecided**. Tasks where one side has no run are left out; where runs are compared by how
+far they are apart, those where one side has fewer than three. There is no correction for the number of
+claims: about one in twenty would pass by luck.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ Verdict = Literal["holds", "does not hold", "undecided", "too few runs"]
 Runs = Sequence[Trace]
 Values = Float[np.ndarray, "_"]
 
-_FEWEST = 2
+_FEWEST_APART = 3
+"""Runs of which distances from the median can differ: those of two are equal."""
 _LEVEL = 0.05
 _EARLY, _HALF, _END = 0.2, (0.4, 0.6), 0.8
 """Shares of a run: its beginning ends, its middle, its end begins."""
@@ -79,12 +81,20 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
     ) -> dict[str, Stratum]:
         return {task: (of(_of(runs, better, task)), of(_of(runs, worse, task))) for task in tasks}
 
+    def apart(wider: str, closer: str, tasks: Sequence[str]) -> dict[str, Stratum]:
+        strata = arms(wider, closer, spreads, tasks)
+        nothing = np.empty(0)
+        return {
+            task: pair if min(map(len, pair)) >= _FEWEST_APART else (nothing, nothing)
+            for task, pair in strata.items()
+        }
+
     compared: list[tuple[str, dict[str, Stratum]]] = [
         ("min-health is above central", arms("min_health", "central", finals, hazard)),
         ("central is above local", arms("central", "local", finals, hazard)),
         ("local is above MADDPG", arms("local", "maddpg", finals, hazard)),
         ("min-health's lead over central grows with the team", _growth(runs, _GROWING[suite])),
-        ("min-health's runs differ less than central's", arms("central", "min_health", spreads, hazard)),
+        ("min-health's runs differ less than central's", apart("central", "min_health", hazard)),
         (
             "local learns first: above central in the first fifth",
             arms("local", "central", early, hazard),
@@ -92,7 +102,7 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
         ("local plateaus: central gains more after half-time", arms("central", "local", late_gains, hazard)),
         ("QMIX fails: local is above it", arms("local", "qmix", finals, hazard)),
         ("without hazard: central is above min-health", arms("central", "min_health", finals, harmless)),
-        ("without hazard: min-health's runs differ more", arms("min_health", "central", spreads, harmless)),
+        ("without hazard: min-health's runs differ more", apart("min_health", "central", harmless)),
     ]
     return [_judged(claim, suite, strata) for claim, strata in compared]
 
@@ -139,7 +149,7 @@ def _leads(runs: Runs, task: str) -> Values:
 
 
 def _judged(claim: str, suite: str, strata: dict[str, Stratum]) -> Judged:
-    enough = {name: pair for name, pair in strata.items() if min(map(len, pair)) >= _FEWEST}
+    enough = {name: pair for name, pair in strata.items() if min(map(len, pair)) > 0}
     missing = tuple(name for name in strata if name not in enough)
     counts = (sum(len(x) for x, _ in enough.values()), sum(len(y) for _, y in enough.values()))
     if not enough:
