@@ -15,7 +15,7 @@ from hipg_bench import make
 from hipg_bench.cli import app
 from hipg_bench.errors import HipgError, SpecError
 from hipg_bench.learning import audit
-from hipg_bench.learning.leverage import leverage
+from hipg_bench.learning.gradient_noise import gradient_noise
 from hipg_bench.learning.mappo import Trainer, networks
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import Settings, recommended
@@ -159,7 +159,7 @@ def test_the_gradients_noise_is_that_of_a_plain_loop() -> None:
     settings = recommended("hazard_nav-4", actor_hidden=(8,), attends=(), critic_hidden=(8,))
     torch.manual_seed(1)
     actor, critic = networks(settings, make(settings.task).layout)
-    found = leverage(actor, critic, settings, worlds=6, seed=500)
+    found = gradient_noise(actor, critic, settings, worlds=6, seed=500)
 
     trainer = Trainer(settings.model_copy(update={"num_envs": 6, "rollout": 50, "seed": 500}))
     trainer.actor.load_state_dict(actor.state_dict())
@@ -191,7 +191,7 @@ def test_a_baseline_that_says_the_same_of_all_states_changes_nothing() -> None:
     with torch.no_grad():
         for parameter in critic.parameters():
             parameter.zero_()
-    found = leverage(actor, critic, settings, worlds=8)
+    found = gradient_noise(actor, critic, settings, worlds=8)
     for name, (low, high) in found.interval.items():
         assert found.noise[name] == pytest.approx(1.0, abs=1e-4)
         assert low == pytest.approx(1.0, abs=1e-4)

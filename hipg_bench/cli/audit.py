@@ -13,7 +13,7 @@ from hipg_bench.errors import HipgError, SpecError
 
 if TYPE_CHECKING:
     from hipg_bench.learning.audit import Audit, Comparison
-    from hipg_bench.learning.leverage import Leverage
+    from hipg_bench.learning.gradient_noise import GradientNoise
 
 _NOISE_WORLDS = 8
 """Episodes that the gradient's noise is measured on, per episode that states are taken from."""
@@ -38,13 +38,13 @@ def audit(
     import torch
 
     from hipg_bench.learning import audit as audits
-    from hipg_bench.learning.leverage import leverage
+    from hipg_bench.learning.gradient_noise import gradient_noise
 
     torch.set_num_threads(threads)
     source = _source(run, agent, task, seed)
     actor, critic, settings = audits.load(source)
     found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=luck)
-    noise = leverage(actor, critic, settings, worlds=_NOISE_WORLDS * worlds, seed=luck)
+    noise = gradient_noise(actor, critic, settings, worlds=_NOISE_WORLDS * worlds, seed=luck)
     if plot is not None:
         audits.draw(found, plot, title=f"{settings.task}, {settings.arm}, seed {settings.seed}")
     if as_json:
@@ -104,7 +104,7 @@ def _print(found: Audit, title: str) -> None:
     )
 
 
-def _print_noise(found: Leverage) -> None:
+def _print_noise(found: GradientNoise) -> None:
     rows = console.table(
         "baseline",
         ">noise of the gradient",

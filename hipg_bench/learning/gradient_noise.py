@@ -25,7 +25,7 @@ _RESAMPLES = 2000
 
 
 @dataclasses.dataclass(frozen=True)
-class Leverage:
+class GradientNoise:
     """What the baselines leave of the gradient's noise.
 
     Attributes:
@@ -44,9 +44,9 @@ class Leverage:
     episodes: int
 
 
-def leverage(
+def gradient_noise(
     actor: Actor, critic: Critic, settings: Settings, *, worlds: int = 256, seed: int = 500
-) -> Leverage:
+) -> GradientNoise:
     """Compare baselines on whole episodes of a policy as it explores.
 
     Args:
@@ -66,19 +66,18 @@ def leverage(
     distance = {
         name: (each - each.mean(0)).square().sum(1).double().numpy() for name, each in gradients.items()
     }
-    central, mean = gradients["central"], gradients["central"].mean(0)
     noise = float(distance["central"].sum()) / (worlds - 1)
-    signal = float(mean.square().sum()) - noise / worlds
+    signal = float(gradients["central"].mean(0).square().sum()) - noise / worlds
     drawn = np.random.default_rng(seed).integers(worlds, size=(_RESAMPLES, worlds))
     base = distance["central"][drawn].sum(1)
-    return Leverage(
+    return GradientNoise(
         noise={name: float(each.sum() / distance["central"].sum()) for name, each in distance.items()},
         interval={
             name: tuple(np.quantile(each[drawn].sum(1) / base, [0.025, 0.975]).tolist())
             for name, each in distance.items()
         },
         scale=noise / signal if signal > 0 else None,
-        episodes=len(central),
+        episodes=worlds,
     )
 
 
