@@ -106,5 +106,5 @@ def _cell(scores: list[float]) -> str:
         return "no runs"
     middle = float(stats.trim_mean(np.array(scores), 0.25))
     if len(scores) == 1:
-        return f"{middle:.2f} (1 run)"
-    return f"{middle:.2f} ({min(scores):.2f} to {max(scores):.2f}, {len(scores)} runs)"
+        return f"{middle:z.2f} (1 run)"
+    return f"{middle:z.2f} ({min(scores):z.2f} to {max(scores):z.2f}, {len(scores)} runs)"
