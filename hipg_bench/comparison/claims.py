@@ -81,20 +81,12 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
     ) -> dict[str, Stratum]:
         return {task: (of(_of(runs, better, task)), of(_of(runs, worse, task))) for task in tasks}
 
-    def apart(wider: str, closer: str, tasks: Sequence[str]) -> dict[str, Stratum]:
-        strata = arms(wider, closer, spreads, tasks)
-        nothing = np.empty(0)
-        return {
-            task: pair if min(map(len, pair)) >= _FEWEST_APART else (nothing, nothing)
-            for task, pair in strata.items()
-        }
-
     compared: list[tuple[str, dict[str, Stratum]]] = [
         ("min-health is above central", arms("min_health", "central", finals, hazard)),
         ("central is above local", arms("central", "local", finals, hazard)),
         ("local is above MADDPG", arms("local", "maddpg", finals, hazard)),
         ("min-health's lead over central grows with the team", _growth(runs, _GROWING[suite])),
-        ("min-health's runs differ less than central's", apart("central", "min_health", hazard)),
+        ("min-health's runs differ less than central's", arms("central", "min_health", spreads, hazard)),
         (
             "local learns first: above central in the first fifth",
             arms("local", "central", early, hazard),
@@ -102,7 +94,7 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
         ("local plateaus: central gains more after half-time", arms("central", "local", late_gains, hazard)),
         ("QMIX fails: local is above it", arms("local", "qmix", finals, hazard)),
         ("without hazard: central is above min-health", arms("central", "min_health", finals, harmless)),
-        ("without hazard: min-health's runs differ more", apart("min_health", "central", harmless)),
+        ("without hazard: min-health's runs differ more", arms("min_health", "central", spreads, harmless)),
     ]
     return [_judged(claim, suite, strata) for claim, strata in compared]
 
@@ -113,9 +105,11 @@ def finals(runs: Runs) -> Values:
 
 
 def spreads(runs: Runs) -> Values:
-    """How far each run ended from the median run (Brown and Forsythe 1974)."""
+    """How far each run ended from the median run (Brown and Forsythe 1974); nothing of fewer than three."""
+    if len(runs) < _FEWEST_APART:
+        return np.empty(0)
     reached = finals(runs)
-    return np.abs(reached - np.median(reached)) if len(reached) else reached
+    return np.abs(reached - np.median(reached))
 
 
 def early(runs: Runs) -> Values:

@@ -53,7 +53,7 @@ def gradient_noise(
         actor: the policy.
         critic: of the joint state.
         settings: of the run, as `hipg_bench.learning.audit.load` gives them.
-        worlds: episodes.
+        worlds: episodes, two or more.
         seed: of the episodes and of all luck.
     """
     whole = {"rollout": task_spec(settings.task).horizon, "num_envs": worlds, "seed": seed}
