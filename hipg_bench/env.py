@@ -297,7 +297,7 @@ class BatchEnv:
         """Observations, the dead blinded (property 4 of the paper), and joint states."""
         observation, layout = self.family.observe(now), self.layout
         dead = now.health == 0
-        if dead.any():
+        if self.spec.dead_observation == "blank" and dead.any():
             observation[dead] = 0.0
             observation[dead, layout.observation.slices[layout.health_block]] = layout.dead_value
         return observation, self.family.state(now)

@@ -65,6 +65,9 @@ class TaskSpec(Params):
         reward_dead: what APIs that pay agents one by one and keep the dead in the team pay them: ``none``,
             and the episode is over when all are dead; or ``team``, the team's reward to the end of the
             task's own episode, so that dying spares nobody a cost. `BatchEnv` pays the team, whatever it is.
+        dead_observation: what is in a dead agent's row of the observation: ``blank``, its health and zeros;
+            or ``live``, what a living agent would observe there, as in the authors' code. Its actions are
+            ignored either way, so that this matters only to learners that train on dead agents' samples.
         params: the family's numbers.
         weights: reward per unit of each term.
         floor: return of an episode whose physics diverged; below anything a policy reaches.
@@ -83,6 +86,7 @@ class TaskSpec(Params):
     clip_actions: bool = True
     graded_health: bool = False
     reward_dead: Literal["none", "team"] = "none"
+    dead_observation: Literal["blank", "live"] = "blank"
     params: dict[str, Any]
     weights: dict[str, float]
     floor: float
@@ -92,7 +96,10 @@ class TaskSpec(Params):
     @property
     def fingerprint(self) -> str:
         """Twelve hex digits over everything that affects behaviour (not over anchors or prose)."""
-        behaviour = self.model_dump(exclude={"anchors", "calibration", "summary", "tags", "reward_dead"})
+        without = {"anchors", "calibration", "summary", "tags", "reward_dead"}
+        if self.dead_observation == "blank":
+            without.add("dead_observation")  # so that tasks keep the fingerprints they had without this field
+        behaviour = self.model_dump(exclude=without)
         text = json.dumps(behaviour, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -118,7 +125,8 @@ class TaskSpec(Params):
             SpecError: unknown field, or a value that is not allowed.
         """
         values = self.model_dump()
-        own = {"num_agents", "horizon", "control_step", "clip_actions", "graded_health", "reward_dead"}
+        own = {"num_agents", "horizon", "control_step", "clip_actions", "graded_health"}
+        own |= {"reward_dead", "dead_observation"}
         for name, value in changes.items():
             if name in own:
                 values[name] = value

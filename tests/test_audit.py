@@ -26,7 +26,9 @@ SMALL = {"num_envs": 8, "rollout": 10, "steps": 80, "actor_hidden": (16,), "crit
 def quiet(settings: Settings) -> tuple[torch.nn.Module, torch.nn.Module]:
     """Networks whose policy hardly explores."""
     torch.manual_seed(3)
-    actor, critic = networks(settings, make(settings.task).layout)
+    actor, critic = networks(
+        settings, make(settings.task).layout, clips=make(settings.task).spec.clip_actions
+    )
     with torch.no_grad():
         actor.log_std.fill_(math.log(1e-6))
     return actor, critic
@@ -158,7 +160,9 @@ def test_the_gradients_noise_is_that_of_a_plain_loop() -> None:
     """Without a baseline the weight is the target minus its mean: the covariance's trace, by NumPy."""
     settings = recommended("hazard_nav-4", actor_hidden=(8,), attends=(), critic_hidden=(8,))
     torch.manual_seed(1)
-    actor, critic = networks(settings, make(settings.task).layout)
+    actor, critic = networks(
+        settings, make(settings.task).layout, clips=make(settings.task).spec.clip_actions
+    )
     found = gradient_noise(actor, critic, settings, worlds=6, seed=500)
 
     trainer = Trainer(settings.model_copy(update={"num_envs": 6, "rollout": 50, "seed": 500}))
@@ -187,7 +191,9 @@ def test_the_gradients_noise_is_that_of_a_plain_loop() -> None:
 
 def test_a_baseline_that_says_the_same_of_all_states_changes_nothing() -> None:
     settings = recommended("coop_nav-3", actor_hidden=(8,), critic_hidden=(8,))
-    actor, critic = networks(settings, make(settings.task).layout)
+    actor, critic = networks(
+        settings, make(settings.task).layout, clips=make(settings.task).spec.clip_actions
+    )
     with torch.no_grad():
         for parameter in critic.parameters():
             parameter.zero_()

@@ -196,14 +196,20 @@ def test_bands_by_hand() -> None:
     assert (high >= middle).all()
 
 
+def worth(task: str, score: float) -> float:
+    """The return of a score: 0 is the random anchor, 1 the reference."""
+    anchors = task_spec(task).anchors
+    return anchors.random.mean + score * (anchors.reference.mean - anchors.random.mean)
+
+
 def write(agents: Path, arm: str, task: str, seed: int, rows, final=None) -> None:
     place = agents / bundle_name(arm) / task
     place.mkdir(parents=True, exist_ok=True)
     with (place / f"seed{seed}.curve.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["steps", "return", "score"], restval="")
+        writer = csv.DictWriter(file, ["steps", "return", "eval_return"], restval="")
         writer.writeheader()
         writer.writerows(rows)
-    record = {} if final is None else {"result": {"score": final}}
+    record = {} if final is None else {"result": {"return": worth(task, final)}}
     (place / f"seed{seed}.json").write_text(json.dumps(record))
 
 
@@ -214,7 +220,11 @@ def agents(tmp_path: Path) -> Path:
     for arm, top in (("min_health", 0.8), ("central", 0.5), ("central-masked", 0.6)):
         for seed in range(4):
             rows = [
-                {"steps": 1000 * k, "return": -1.0, "score": top * k / 20 + 0.01 * rng.normal()}
+                {
+                    "steps": 1000 * k,
+                    "return": -1.0,
+                    "eval_return": worth("paper_comm-10", top * k / 20 + 0.01 * rng.normal()),
+                }
                 for k in range(1, 21)
             ]
             write(folder, arm, "paper_comm-10", seed, rows, final=top + 0.01 * rng.normal())
@@ -243,6 +253,17 @@ def test_curves_come_from_trials_and_else_from_training(agents: Path) -> None:
     record = agents / "mappo_local" / "hazard_nav-4" / "seed7.json"
     record.write_text(json.dumps({"settings": {"weights": {"alive": 0.1}}}))
     assert "local" not in {one.arm for one in traces(agents)}
+
+
+def test_runs_of_a_task_are_compared_by_one_measurement(agents: Path) -> None:
+    """One run without periodic evaluations: all of the task are shown by their training's returns."""
+    rows = [{"steps": 1000 * k, "return": worth("paper_comm-10", 0.25)} for k in range(1, 21)]
+    write(agents, "central", "paper_comm-10", 9, rows, final=0.75)
+    found = traces(agents)
+    assert not any(one.tried for one in found)
+    (added,) = [one for one in found if one.seed == 9]
+    np.testing.assert_allclose(added.score, 0.25)
+    assert added.final == pytest.approx(0.75)
 
 
 def test_figures_and_page(agents: Path, tmp_path: Path) -> None:

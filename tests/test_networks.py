@@ -44,11 +44,14 @@ def by_hand(content, form, observation, agent):
     if form.head == "bins":
         places = [int(np.argmax(out[start : start + form.bins])) for start in range(0, 4, form.bins)]
         return form.reach * np.array([np.linspace(-1, 1, form.bins)[place] for place in places])
+    if form.head == "linear":
+        return form.reach * out
     return form.reach * (np.tanh(out) if form.head == "tanh" else np.clip(out, -1, 1))
 
 
 FORMS = [
     Form(),
+    Form(head="linear"),
     Form(activation="relu", head="tanh", reach=5.0),
     Form(activation="relu", head="bins", bins=2),
     Form(activation="relu", head="bins", bins=4),

@@ -645,3 +645,49 @@ def test_communication_chain_earns_what_it_earns_in_the_authors_code(cap, peak, 
     if (cap, peak) == (5.0, 0.5):
         assert agree(played["deaths"], 1.03, played["deaths"].std(), 60)
         assert agree(50 * played["connected"], 44.8, (50 * played["connected"]).std(), 60)
+
+
+# ------------------------------------------------------------------- what the dead observe in training
+
+
+def nearest_others(places, i, dead):
+    """Relative places of the dead but agent i, nearest first, in five slots."""
+    gaps = sorted((places[j] - places[i] for j in dead if j != i), key=lambda gap: math.hypot(*gap))
+    return np.array([*gaps, *[np.zeros(2)] * 5][:5])
+
+
+@pytest.mark.parametrize("task", ["paper_nav-4", "paper_comm-10"])
+def test_live_observations_of_the_dead_are_those_of_the_authors(task):
+    """A dead agent's row: flag 1, own motion, the other dead listed; it counts others in navigation only."""
+    env = hipg_bench.make(task, num_envs=1, threads=1, dead_observation="live")
+    n = env.num_agents
+    places = np.random.default_rng(3).uniform(-0.7, 0.7, (n, 2))
+    step = arrange(env, places[None], velocity=np.full((1, n, 2), 0.25), dead=(0, 2))
+    points = env._sim.marker[0, :, :2]
+    for i in (0, 2):
+        assert seen(env, step, "terminated", agent=i) == 1
+        np.testing.assert_allclose(seen(env, step, "position", agent=i), places[i], atol=1e-6)
+        listed = seen(env, step, "dead_position", agent=i)
+        np.testing.assert_allclose(listed, nearest_others(places, i, (0, 2)), atol=1e-6)
+        live = [places[j] - places[i] for j in range(n) if j not in (0, 2)]
+        inside = sum(math.hypot(*gap) <= 1.0 for gap in live)
+        assert seen(env, step, "other_count", agent=i).sum() == (inside if task == "paper_nav-4" else 0)
+        if task == "paper_nav-4":
+            near = sum(math.hypot(*(point - places[i])) <= 1.0 for point in points)
+            assert seen(env, step, "point_count", agent=i).sum() == near
+    blank = hipg_bench.make(task, num_envs=1, threads=1)
+    other = arrange(blank, places[None], velocity=np.full((1, n, 2), 0.25), dead=(0, 2))
+    living = [i for i in range(n) if i not in (0, 2)]
+    np.testing.assert_array_equal(step.observation[0, living], other.observation[0, living])
+    assert other.observation[0, 0].sum() == 1  # its flag alone
+
+
+def test_the_dead_look_back_as_they_looked():
+    """The previous step's half of a live dead agent's row is the row of the step before."""
+    env = hipg_bench.make("paper_nav-4", num_envs=2, threads=1, dead_observation="live")
+    before = arrange(env, np.random.default_rng(0).uniform(-0.7, 0.7, (2, 4, 2)), dead=(1,))
+    after = env.step(np.full((2, 4, 2), 0.5))
+    half = before.observation.shape[-1] // 2
+    np.testing.assert_array_equal(after.observation[..., half:], before.observation[..., :half])
+    again = env.load_rows(np.arange(2), env.rows)
+    np.testing.assert_array_equal(again.observation, after.observation)

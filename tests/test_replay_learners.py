@@ -377,22 +377,6 @@ def test_a_buffer_beyond_the_disk_is_refused(tmp_path: Path) -> None:
         maddpg.Trainer(recommended("hazard_comm-16", arm="maddpg", buffer=100_000_000), tmp_path)
 
 
-FAST = {"num_envs": 50, "learning_starts": 1000, "gamma": 0.9, "target_share": 0.05, "hidden": (64, 64)}
-
-
-def test_maddpg_learns_in_half_a_minute(tmp_path: Path) -> None:
-    changes = {**FAST, "critic_hidden": (128, 128), "noise_steps": 20_000}
-    trainer = maddpg.Trainer(recommended("coop_nav-3", arm="maddpg", **changes), tmp_path)
-    returns = [trainer.iterate()["return"] for _ in range(6)]
-    assert np.mean(returns[-2:]) > returns[0] + 4
-
-
-def test_qmix_learns_in_half_a_minute(tmp_path: Path) -> None:
-    trainer = qmix.Trainer(recommended("coop_nav-3", arm="qmix", **FAST, epsilon_steps=10_000), tmp_path)
-    returns = [trainer.iterate()["return"] for _ in range(12)]
-    assert np.mean(returns[-2:]) > returns[0] + 4
-
-
 def test_the_authors_maddpg_is_the_papers_preset() -> None:
     settings = paper("paper_nav-8", arm="maddpg")
     # facts sheet, section 5

@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +32,7 @@ class Trace:
         steps: (K,) environment steps, rising.
         score: (K,) there, 0 as random actions and 1 as the reference.
         tried: scores are of trials without exploration; else of the training's own episodes.
-        final: what the last policy reached by the standard protocol; else the mean of the last tenth.
+        final: score of the last policy by the standard protocol; else the mean of the last tenth.
     """
 
     arm: str
@@ -52,15 +51,25 @@ class Trace:
 
 
 def traces(agents: Path) -> list[Trace]:
-    """Read all curves of bundles that are arms of the comparison, on tasks that have a score."""
-    found: list[Trace] = []
+    """Read all curves of bundles that are arms of the comparison, on tasks that have a score.
+
+    The runs of a task are compared by the same measurement: by periodic evaluations where all runs have
+    them, else by the returns of the training's own episodes.
+    """
+    curves: dict[str, list[tuple[Path, str, TaskSpec, int]]] = {}
     for folder in sorted(agents.glob("*/")):
         arm = _arm(folder.name)
         for path in sorted(folder.glob("*/seed*.curve.csv")) if arm is not None else ():
             spec, seed = tasks().get(path.parent.name), re.match(r"seed(\d+)\.", path.name)
             if arm is not None and spec is not None and spec.anchors is not None and seed is not None:
-                found += _read(path, arm, spec, int(seed[1]))
-    return found
+                curves.setdefault(spec.task, []).append((path, arm, spec, int(seed[1])))
+    found: list[Trace] = []
+    for ones in curves.values():
+        evaluated = [_read(*one, tried=True) for one in ones]
+        trained = [_read(*one, tried=False) for one in ones]
+        chosen = trained if None in evaluated and any(trained) else evaluated
+        found += [one or other for one, other in zip(chosen, evaluated, strict=True) if one or other]
+    return sorted(found, key=lambda run: (run.arm, run.task, run.seed))
 
 
 def blocks(
@@ -81,19 +90,30 @@ def _arm(bundle: str) -> str | None:
     return None
 
 
-def _read(path: Path, arm: str, spec: TaskSpec, seed: int) -> Iterator[Trace]:
-    """The run of a curve, if anything was measured that can be compared."""
+def _read(path: Path, arm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Trace | None:
+    """The run of a curve on today's anchors, if what is asked for was measured.
+
+    Args:
+        path: of the curve.
+        arm: whose.
+        spec: the task.
+        seed: of the training.
+        tried: the periodic evaluations' returns; else those of the training's own episodes.
+    """
     record = json.loads(path.with_name(f"seed{seed}.json").read_text(encoding="utf-8"))
+    column = "eval_return" if tried else "return"
+    if not tried and record.get("settings", {}).get("weights"):
+        return None  # training paid for other things
     with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    scores = [(float(row["steps"]), float(row["score"])) for row in rows if row.get("score")]
-    tried = len(scores) > 1
-    if not tried and not record.get("settings", {}).get("weights"):  # else it was paid for other things
-        returns = [(float(row["steps"]), float(row["return"])) for row in rows if row.get("return")]
-        scores = [(steps, spec.score(value)) for steps, value in returns]
-    if not scores:
-        return
-    steps, score = np.array(scores).T
-    final = record.get("result", {}).get("score")
+        points = [
+            (float(row["steps"]), float(row[column])) for row in csv.DictReader(file) if row.get(column)
+        ]
+    if len(points) < 1 + tried:
+        return None
+    steps, returns = np.array(points).T
+    score = np.array([spec.score(value) for value in returns])
+    final = record.get("result", {}).get("return")
     last = score[steps > (1 - _END) * steps[-1]].mean()
-    yield Trace(arm, spec.task, seed, steps, score, tried, float(last if final is None else final))
+    return Trace(
+        arm, spec.task, seed, steps, score, tried, float(last if final is None else spec.score(final))
+    )

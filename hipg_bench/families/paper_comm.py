@@ -20,7 +20,7 @@ from hipg_bench.families import paper_particles as particles
 from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import plane
+from hipg_bench.mechanics import looks, plane
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
 
@@ -56,6 +56,7 @@ class Snapshot(particles.Snapshot):
 class PaperComm(particles.Particles[Snapshot]):
     """Rules of the paper's communication; see `hipg_bench.families.family.Family` for each method."""
 
+    live_dead_look: int = looks.NO_AGENTS  # the dead hear nobody
     metrics: tuple[str, ...] = ("connected", "collisions", *particles.DEATH_METRICS)
 
     def __init__(self, spec: TaskSpec) -> None:

@@ -22,7 +22,7 @@ from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker, asset, attach
 from hipg_bench.layout import Block, Layout, TaskLayout
-from hipg_bench.mechanics import hazards, plane
+from hipg_bench.mechanics import hazards, looks, plane
 from hipg_bench.mechanics import health as health_law
 from hipg_bench.mechanics.few import few
 from hipg_bench.sim import Sim
@@ -91,6 +91,8 @@ class Particles(abc.ABC, Generic[S]):
     layout: TaskLayout
     _look_layout: Layout
     causes: tuple[str, ...] = CAUSES
+    live_dead_look: int = looks.ALL
+    """What the dead see where the task's ``dead_observation`` is ``live``."""
     physics_steps: int = 1
 
     def __init__(self, spec: TaskSpec, params: ParticleParams, radius: float) -> None:
@@ -165,7 +167,8 @@ class Particles(abc.ABC, Generic[S]):
 
     def _see(self, now: S, past: Float32[np.ndarray, "n N K"]) -> tuple[np.ndarray, np.ndarray]:
         """This step's part of the histogram observation, and the whole of it."""
-        return senses.look(self._look_layout, now, self._hints(now), past, now.sim.threads)
+        dead_look = self.live_dead_look if self.spec.dead_observation == "live" else looks.NOTHING
+        return senses.look(self._look_layout, now, self._hints(now), dead_look, past, now.sim.threads)
 
     def _look_back(self, now: S) -> Float32[np.ndarray, "n N K"]:
         """The previous step's part; where nobody kept it, from what the rows remember; zeros at first."""

@@ -63,14 +63,20 @@ class Hints(NamedTuple):
 
 
 def look(
-    layout: Layout, now: Body, hints: Hints, past: Float32[np.ndarray, "B N K"], threads: int
+    layout: Layout,
+    now: Body,
+    hints: Hints,
+    dead_look: int,
+    past: Float32[np.ndarray, "B N K"],
+    threads: int,
 ) -> tuple[Float32[np.ndarray, "B N K"], Float32[np.ndarray, "B N 2*K"]]:
-    """One control step's part of the histogram observation, and the whole of it; the dead see zeros.
+    """One control step's part of the histogram observation, and the whole of it.
 
     Args:
         layout: of one step's part.
         now: the control step.
         hints: what is told and shown.
+        dead_look: what the dead see, see `hipg_bench.mechanics.looks.see`.
         past: the previous step's part.
         threads: how many to use.
     """
@@ -83,7 +89,7 @@ def look(
         looks.see(
             now.position[part], now.velocity[part], dead[part], now.point[part], hints.shown[part],
             hints.known[part], hints.told[part], past[part],
-            start["other_count"], points, start["dead_position"], hazard, seen[part], both[part],
+            start["other_count"], points, start["dead_position"], hazard, dead_look, seen[part], both[part],
         )  # fmt: skip
 
     on_threads(see, len(dead), threads)

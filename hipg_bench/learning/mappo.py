@@ -35,6 +35,8 @@ from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
 """Bounds of the actor's learning rate."""
+_ENTROPY_WEIGHTS = (1e-5, 0.1)
+"""Bounds of the entropy bonus where it follows ``target_entropy``."""
 _START_COUNTS = 20
 """Rollouts that the normalisation of a start weighs."""
 _PIECE = 4096
@@ -83,8 +85,10 @@ class Trainer:
             settings.seed,
             threads=torch.get_num_threads(),
             weights=settings.weights,
+            dead_observation=settings.dead_observation,
         )
-        self.actor, self.critic = networks(settings, self.env.layout)
+        self.entropy_weight = settings.entropy
+        self.actor, self.critic = networks(settings, self.env.layout, clips=self.env.spec.clip_actions)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, eps=1e-5)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, eps=1e-5)
         self.iteration = 0
@@ -185,11 +189,11 @@ class Trainer:
     def assign_credit(self, data: Rollout) -> tuple[Float[Tensor, "T B K"], Float[Tensor, "T B N"]]:
         """Value targets (eqn:value_target), and each agent's weight Psi (the arm).
 
-        There are K = N critics' views in the arm ``local``, else K = 1. Running normalisation takes in
-        the rollout on the way.
+        There are K = N critics' views in the arm ``local``, else K = 1. The critic's running normalisation
+        takes in the rollout on the way; the actor's does so after its update, since the ratio of new to
+        old probabilities must be of the observations as the rollout normalised them.
         """
         settings = self.settings
-        self.actor.norm.update(data.observation[:-1][data.health > 0])
         self.critic.norm.update(self._shown(data)[0][:-1].flatten(0, -2))
         value, target = self.value_targets(data)
         masked = settings.mask_dead or settings.arm == "min_health"
@@ -237,7 +241,9 @@ class Trainer:
         self, data: Rollout, target: Float[Tensor, "T B K"], psi: Float[Tensor, "T B N"]
     ) -> dict[str, float]:
         """Improve actor and critic on a rollout. Returns what to log."""
-        return self._update_actor(data, psi) | self._update_critic(data, target)
+        log = self._update_actor(data, psi) | self._update_critic(data, target)
+        self.actor.norm.update(data.observation[:-1][data.health > 0])
+        return log
 
     def _update_actor(self, data: Rollout, psi: Float[Tensor, "T B N"]) -> dict[str, float]:
         """Ascend the clipped surrogate with entropy (eqn:surrogate_objective_clipped)."""
@@ -258,15 +264,18 @@ class Trainer:
                     policy = self.actor.distribution(observation.index_select(0, piece))
                     change = policy.log_prob(action[piece]).sum(-1) - log_prob[piece]
                     spread = policy.entropy().sum(-1).mean()
-                    loss = -losses.surrogate(change, psi_of, settings.clip) - settings.entropy * spread
+                    loss = -losses.surrogate(change, psi_of, settings.clip) - self.entropy_weight * spread
                     (loss * (len(piece) / len(part))).backward()
                     # k3 estimator of KL(old, new): unbiased and never negative
                     divergence += float((change.exp() - 1 - change).sum().detach()) / len(weight)
                     entropy = float(spread.detach())
                 _step(self.actor_optimizer, settings.max_grad_norm)
             self._follow_divergence(divergence)
+        self._follow_entropy(entropy / self.env.action_size)
         rate = self.actor_optimizer.param_groups[0]["lr"]
-        return {"kl": divergence, "entropy": entropy, "actor_rate": rate}
+        return {
+            "kl": divergence, "entropy": entropy, "actor_rate": rate, "entropy_weight": self.entropy_weight,
+        }  # fmt: skip
 
     def _follow_divergence(self, divergence: float) -> None:
         """Keep the policy's change per rollout near ``target_kl`` by moving the learning rate."""
@@ -275,6 +284,13 @@ class Trainer:
             return
         factor = 1 / 1.5 if divergence > 2 * target else 1.5 if divergence < target / 2 else 1.0
         group["lr"] = float(np.clip(group["lr"] * factor, *_RATES))
+
+    def _follow_entropy(self, entropy: float) -> None:
+        """Keep the policy's entropy per action coordinate near ``target_entropy`` by moving the bonus."""
+        target = self.settings.target_entropy
+        if target is not None:
+            factor = 1.1 if entropy < target else 1 / 1.1
+            self.entropy_weight = float(np.clip(self.entropy_weight * factor, *_ENTROPY_WEIGHTS))
 
     def _update_critic(self, data: Rollout, target: Float[Tensor, "T B K"]) -> dict[str, float]:
         """Descend the squared error of normalised values (eqn:value_update)."""
@@ -341,6 +357,7 @@ class Trainer:
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "random": torch.get_rng_state(),
             "worlds": torch.from_numpy(self.env.rows),
+            "entropy_weight": self.entropy_weight,
         }
         if self.forks is not None:
             content["forks"] = torch.from_numpy(self.forks.env.rows)
@@ -356,6 +373,7 @@ class Trainer:
         content = torch.load(path, weights_only=True)
         self.settings.check_resumes(content["settings"], path)
         self.iteration = content["iteration"]
+        self.entropy_weight = content.get("entropy_weight", self.settings.entropy)
         self.actor.load_state_dict(content["actor"])
         self.critic.load_state_dict(content["critic"])
         self.actor_optimizer.load_state_dict(content["actor_optimizer"])
@@ -366,14 +384,22 @@ class Trainer:
         torch.set_rng_state(content["random"])
 
 
-def networks(settings: Settings, layout: TaskLayout) -> tuple[Actor, Critic]:
-    """Fresh actor and critic for a run."""
+def networks(settings: Settings, layout: TaskLayout, *, clips: bool) -> tuple[Actor, Critic]:
+    """Fresh actor and critic for a run.
+
+    Args:
+        settings: of the run.
+        layout: of the task's vectors.
+        clips: whether the task clips actions; where it does not, the exported policy must not either.
+    """
+    head = "mean" if clips else "linear"
+    groups = settings.attends
     actor = Actor(
         layout.observation.size,
         layout.action.size,
         settings.actor_hidden,
         settings.std,
-        form=AttentionForm.of(layout.observation, *settings.attends) if settings.attends else Form(),
+        form=AttentionForm.of(layout.observation, *groups, head=head) if groups else Form(head=head),
         normalize=settings.normalize_inputs,
     )
     local = settings.arm == "local"

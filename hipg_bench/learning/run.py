@@ -172,7 +172,11 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
         "task_version": spec.version,
         "task_fingerprint": spec.fingerprint,
         "settings": settings.model_dump(),
-        "evaluation": {"seed": trial.SEED, "episodes": trial.EPISODES, "exploration": False},
+        "evaluation": {
+            "seed": trial.SEED,
+            "episodes": trial.num_episodes(settings.task),
+            "exploration": False,
+        },
         "env_steps": steps,
         "agent_steps": steps * spec.num_agents,
         "seconds": seconds,

@@ -81,7 +81,10 @@ class Settings(RunSettings):
         epochs, minibatches: passes over a rollout, and parts each is cut into.
         lam: GAE's lambda.
         clip: PPO's epsilon.
-        entropy: weight of the entropy bonus.
+        entropy: weight of the entropy bonus; its first value where ``target_entropy`` is given.
+        target_entropy: entropy of an action coordinate, nats, that the weight is moved towards after every
+            rollout, so that runs of different credit rules explore alike; None leaves the weight alone. A
+            normal distribution of standard deviation s has 1.42 + log(s).
         start: policy file whose weights the actor begins with, of any task with the same observations and
             actions; the critic begins anew. So larger teams go on from what smaller ones learned.
         actor_rate: the actor's first learning rate; it then follows ``target_kl``.
@@ -98,6 +101,9 @@ class Settings(RunSettings):
             ``min_health`` leaves them without weight, as in the authors' code.
         zero_dead_actions: a dead agent's action is stored as zeros beside the log-probability of what
             it had drawn, a quirk of the authors' code; matters only where the dead are not masked.
+        dead_observation: what a dead agent's row of the observation holds in training: ``blank``, its health
+            and zeros; or ``live``, what a living agent would observe there, as in the authors' code. Matters
+            only where the dead are not masked.
         psi_over: Psi is normalised over the rollout's live samples, over the whole ``batch``, zeros of
             the dead included, or anew over every ``minibatch``.
         value_clip: how far a value may move in an update before its gradient is cut, in units of
@@ -117,6 +123,7 @@ class Settings(RunSettings):
     lam: float = pydantic.Field(default=0.95, ge=0, le=1)
     clip: float = pydantic.Field(default=0.2, gt=0, lt=1)
     entropy: float = pydantic.Field(default=0.002, ge=0, le=1)
+    target_entropy: float | None = pydantic.Field(default=None, ge=-10, le=10)
     start: str | None = None
     actor_rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     critic_rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
@@ -128,6 +135,7 @@ class Settings(RunSettings):
     attends: tuple[str, ...] = ()
     mask_dead: bool = True
     zero_dead_actions: bool = False
+    dead_observation: Literal["blank", "live"] = "blank"
     psi_over: Literal["live", "batch", "minibatch"] = "live"
     value_clip: float | None = pydantic.Field(default=None, gt=0)
     normalize_inputs: bool = True

@@ -9,15 +9,18 @@ from scipy import stats
 
 from hipg_bench.env import BatchEnv
 from hipg_bench.policies.policy import Policy
-from hipg_bench.registry import make
+from hipg_bench.registry import make, task_spec
 
 SEED = 30_000
 """The worlds' seed. Training has the seeds 0..999, scores those from 1000 on, calibration 10,000 and 20,000.
 
 It is one for all runs, so that the points of all curves of a task are of the same worlds and the same luck.
 """
-EPISODES = 32
-"""Worlds; the first episode of each counts."""
+
+
+def num_episodes(task: str) -> int:
+    """Worlds of a periodic evaluation, of which the first episode counts: 128 of the paper's, else 32."""
+    return 128 if "paper" in task_spec(task).tags else 32
 
 
 class Trial:
@@ -28,7 +31,7 @@ class Trial:
     """
 
     def __init__(self, task: str, *, threads: int = 1) -> None:
-        self.env: BatchEnv = make(task, EPISODES, SEED, threads=threads)
+        self.env: BatchEnv = make(task, num_episodes(task), SEED, threads=threads)
 
     def play(self, policy: Policy) -> dict[str, float]:
         """Play every world's first episode.
@@ -40,10 +43,11 @@ class Trial:
             scale, with ``score_low`` and ``score_high``, the ends of Student's 95 % interval of the mean
             over the episodes.
         """
-        env, episodes = self.env, np.arange(EPISODES)
+        env = self.env
+        episodes = np.arange(env.num_envs)
         step = env.reset(episodes)
         memory = policy.initial_state(SEED, episodes, env.num_agents)
-        returns = np.full(EPISODES, np.nan)
+        returns = np.full(env.num_envs, np.nan)
         while np.isnan(returns).any():
             action, memory = policy.act(step.observation, memory, step.info["alive"])
             step = env.step(action)
@@ -51,6 +55,6 @@ class Trial:
         mean = float(returns.mean())
         if env.spec.anchors is None:
             return {"eval_return": mean}
-        half = float(stats.t.ppf(0.975, EPISODES - 1) * returns.std(ddof=1) / math.sqrt(EPISODES))
+        half = float(stats.t.ppf(0.975, len(returns) - 1) * returns.std(ddof=1) / math.sqrt(len(returns)))
         low, high = env.spec.score(mean - half), env.spec.score(mean + half)
         return {"eval_return": mean, "score": env.spec.score(mean), "score_low": low, "score_high": high}

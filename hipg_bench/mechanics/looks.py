@@ -16,6 +16,8 @@ from hipg_bench.native import compiled
 
 LISTED = 5
 """Dead agents that a look lists."""
+NOTHING, NO_AGENTS, ALL = range(3)
+"""What the dead see."""
 _CELLS = RINGS * SECTORS
 _EDGE0, _EDGE1, _EDGE2, _EDGE3 = EDGES.tolist()
 _SLOPE = math.tan(math.pi / 8)
@@ -39,17 +41,18 @@ def see(
     points: int,
     listed: int,
     hazard: int,
+    dead_look: int,
     look: Float32[np.ndarray, "B N K"],
     both: Float32[np.ndarray, "B N 2*K"],
 ) -> None:
-    """Look around, and put it before what was seen in the step before; the rows of the dead are zeros.
+    """Look around, and put it before what was seen in the step before.
 
-    A look begins with 0 (not dead), the agent's own velocity and position, and what all are told.
+    A look begins with whether the agent is dead, its velocity and position, and what all are told.
 
     Args:
         position: of the agents, m.
         velocity: m/s.
-        dead: who neither sees nor is counted, but listed.
+        dead: who is not counted, but listed.
         point: places, m.
         shown: those that are counted.
         known: those of which the nearest is listed.
@@ -59,6 +62,8 @@ def see(
         points: the same for that of points; -1 where there is none.
         listed: the same for the nearest dead.
         hazard: the same for the nearest known point; -1 where there is none.
+        dead_look: what the dead see: `NOTHING`, zeros; `NO_AGENTS`, all but the histogram of other agents;
+            `ALL`, what the living see. No agent lists itself.
         look: written into.
         both: written into: looks, then past looks.
     """
@@ -76,11 +81,11 @@ def see(
         deaths, knowledge = how_many(world, dead), how_many(world, known)
         for i in range(agents):
             row = look[world, i]
-            if dead[world, i]:
+            if dead[world, i] and dead_look == NOTHING:
                 row[:] = 0.0
                 both[world, i] = 0.0
                 continue
-            row[0] = 0.0
+            row[0] = 1.0 if dead[world, i] else 0.0
             for axis in range(2):
                 row[1 + axis], row[3 + axis] = velocity[world, i, axis], position[world, i, axis]
             for k in range(told.shape[1]):
@@ -88,7 +93,7 @@ def see(
             count_around(i, x, y, kind, cell, count)
             cells = row[others : others + _CELLS]
             for k in range(len(cells)):
-                cells[k] = count[_AGENT + k]
+                cells[k] = 0 if dead[world, i] and dead_look == NO_AGENTS else count[_AGENT + k]
             if points >= 0:
                 cells = row[points : points + _CELLS]
                 for k in range(len(cells)):
@@ -96,11 +101,11 @@ def see(
             for k in range(2 * LISTED):
                 row[listed + k] = 0.0
             if deaths:
-                list_nearest(world, i, position, position, dead, LISTED, listed, look)
+                list_nearest(world, i, position, position, dead, i, LISTED, listed, look)
             if hazard >= 0:
                 row[hazard] = row[hazard + 1] = 0.0
                 if knowledge:
-                    list_nearest(world, i, position, point, known, 1, hazard, look)
+                    list_nearest(world, i, position, point, known, -1, 1, hazard, look)
             for k in range(size):
                 both[world, i, k] = row[k]
             for k in range(size):
@@ -167,6 +172,7 @@ def list_nearest(
     position: Float[np.ndarray, "B N 2"],
     thing: Float[np.ndarray, "B M 2"],
     counts: Bool[np.ndarray, "B M"],
+    itself: int,
     slots: int,
     column: int,
     seen: Float32[np.ndarray, "B N O"],
@@ -179,6 +185,7 @@ def list_nearest(
         position: of the agents, m.
         thing: m. Things as far as each other go by number.
         counts: which things do.
+        itself: the thing that is the agent, which is left out; -1 where none is.
         slots: how many things at most.
         column: of the first.
         seen: written into.
@@ -187,7 +194,7 @@ def list_nearest(
     for slot in range(min(slots, how_many(world, counts))):
         which, nearest = -1, math.inf
         for k in range(thing.shape[1]):
-            if counts[world, k]:
+            if counts[world, k] and k != itself:
                 x = thing[world, k, 0] - position[world, i, 0]
                 y = thing[world, k, 1] - position[world, i, 1]
                 away = x * x + y * y

@@ -37,16 +37,17 @@ class Form(Params):
 
     Attributes:
         activation: of the hidden layers.
-        head: how the last layer's outputs become the action: ``mean``, cut to [-1, 1]; ``tanh``, squashed
-            into it; ``bins``, values of evenly spaced choices, of which the best is taken.
+        head: how the last layer's outputs become the action: ``mean``, clipped to [-1, 1]; ``linear``, as
+            they are, for tasks that do not clip actions (the paper's particles); ``tanh``, squashed into
+            [-1, 1]; ``bins``, values of evenly spaced choices, of which the best is taken.
         bins: choices per action coordinate, -1 the first and 1 the last; 0 with other heads.
-        reach: full action; above 1 only where a task does not clip (the paper's particles).
+        reach: full action, which bounded outputs are multiplied by; above 1 only where a task does not clip.
     """
 
     format: ClassVar[str] = "hipg-mlp-2"
 
     activation: Literal["tanh", "relu"] = "tanh"
-    head: Literal["mean", "tanh", "bins"] = "mean"
+    head: Literal["mean", "linear", "tanh", "bins"] = "mean"
     bins: int = pydantic.Field(default=0, ge=0, le=256)
     reach: float = pydantic.Field(default=1.0, gt=0, le=10)
 
@@ -55,11 +56,13 @@ class Form(Params):
         return np.tanh(x) if self.activation == "tanh" else np.maximum(x, 0.0)
 
     def action(self, out: Float[np.ndarray, "B N out"]) -> Float[np.ndarray, "B N A"]:
-        """The last layer's outputs as actions in [-reach, reach]."""
+        """The last layer's outputs as actions, in [-reach, reach] unless the head is ``linear``."""
         if self.head == "bins":
             values = out.reshape(*out.shape[:-1], -1, self.bins)
             best = on_grid(values).argmax(-1)  # rounded: equal values stay equal, the first wins
             chosen = 2.0 * best / (self.bins - 1) - 1.0
+        elif self.head == "linear":
+            chosen = out
         else:
             chosen = np.tanh(out) if self.head == "tanh" else np.clip(out, -1.0, 1.0)
         return on_grid(chosen * self.reach)

@@ -61,7 +61,8 @@ class Scripted:
         target = plan(self._spec, self._layout, state, alive, self._blind)
         position = self._layout.state.view(state, "position")
         velocity = self._layout.state.view(state, "velocity")
-        return np.clip(stiffness * (target - position) - damping * velocity, -1.0, 1.0), memory
+        action = stiffness * (target - position) - damping * velocity
+        return (np.clip(action, -1.0, 1.0) if self._spec.clip_actions else action), memory
 
 
 def _navigate(
