@@ -63,13 +63,14 @@ def traces(agents: Path) -> list[Trace]:
             spec, seed = tasks().get(path.parent.name), re.match(r"seed(\d+)\.", path.name)
             if arm is not None and spec is not None and spec.anchors is not None and seed is not None:
                 curves.setdefault(spec.task, []).append((path, arm, spec, int(seed[1])))
-    found: list[Trace] = []
+    found: list[Trace | None] = []
     for ones in curves.values():
         evaluated = [_read(*one, tried=True) for one in ones]
         trained = [_read(*one, tried=False) for one in ones]
         chosen = trained if None in evaluated and any(trained) else evaluated
-        found += [one or other for one, other in zip(chosen, evaluated, strict=True) if one or other]
-    return sorted(found, key=lambda run: (run.arm, run.task, run.seed))
+        found += [one or other for one, other in zip(chosen, evaluated, strict=True)]
+    runs = [run for run in found if run is not None]
+    return sorted(runs, key=lambda run: (run.arm, run.task, run.seed))
 
 
 def blocks(
