@@ -51,5 +51,8 @@ def __getattr__(name: str) -> Any:
     """Import on first use: the command line answers before MuJoCo is loaded, and may choose its GL first."""
     for module, names in _HOMES.items():
         if name in names:
-            return getattr(importlib.import_module(f"hipg_bench.{module}"), name)
+            from hipg_bench import processes
+
+            with processes.children_leave_out_the_working_folder():  # MuJoCo's import starts one
+                return getattr(importlib.import_module(f"hipg_bench.{module}"), name)
     raise AttributeError(f"module 'hipg_bench' has no attribute {name!r}")

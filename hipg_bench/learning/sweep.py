@@ -28,6 +28,7 @@ from typing import Any, Literal, NamedTuple
 import pydantic
 import torch
 
+from hipg_bench import processes
 from hipg_bench.errors import SpecError
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, AnySettings
@@ -130,6 +131,7 @@ def work_off(runs: list[Run], workers: int, report: Callable[[list[Run]], None])
         HipgError: what a run raised; the others end first.
     """
     context = multiprocessing.get_context("spawn")
+    os.environ["PYTHONSAFEPATH"] = "1"  # the workers' modules are not taken from the working folder
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         waiting: set[Future[None]] = {
             pool.submit(_train, run.settings, run.out, run.command) for run in runs if not run.finished
@@ -195,6 +197,7 @@ def _runs(group: Group, out: Path) -> Iterator[Run]:
 
 
 def _train(settings: AnySettings, out: Path, command: str) -> None:
+    processes.leave_out_the_working_folder()
     torch.set_num_threads(1)
     train(settings, out, command=command, report=_stop_when_orphaned)
 

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from hipg_bench import processes
 from hipg_bench.errors import HipgError, RenderError
 from hipg_bench.paths import replacing
 from hipg_bench.registry import task_spec
@@ -130,11 +131,13 @@ def _run_child(folder: Path, backend: str, task: str, progress: Progress | None)
     Raises:
         RenderError: it failed, with its last words.
     """
-    command = [sys.executable, "-m", __spec__.name, str(folder), str(os.getpid())]
+    command = processes.python("-m", __spec__.name, str(folder), str(os.getpid()))
     with (folder / "stderr").open("w+b") as said:
         ear, mouth = os.pipe()
         with open(ear, "rb", buffering=0) as pipe, open(mouth, "wb") as child_end:
-            child = subprocess.Popen(command, env=gl.environment(backend), stdout=child_end, stderr=said)
+            child = subprocess.Popen(
+                command, env=gl.environment(backend), cwd="/", stdout=child_end, stderr=said
+            )
             child_end.close()
             try:
                 hung = not _listen(pipe, progress)

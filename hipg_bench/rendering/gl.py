@@ -14,6 +14,8 @@ import subprocess
 import sys
 import time
 
+from hipg_bench import processes
+
 BACKENDS = ("egl", "osmesa")
 """In order of preference: EGL also finds GPUs, OSMesa is software only."""
 MEND = "apt-get install -y libegl1 libgl1-mesa-dri libosmesa6"
@@ -46,22 +48,25 @@ def environment(backend: str) -> dict[str, str]:
     """Environment variables under which a child process renders with ``backend``."""
     # software rendering: leave half of the cores to a film beside this one
     threads = str(max(1, (os.cpu_count() or 1) // 2))
-    return {
-        "LP_NUM_THREADS": threads,
-        **os.environ,
-        "MUJOCO_GL": backend,
-        "PYOPENGL_PLATFORM": backend,
-        "OMP_NUM_THREADS": "1",
-    }
+    threads = os.environ.get("LP_NUM_THREADS", threads)
+    return processes.environment(
+        LP_NUM_THREADS=threads, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend, OMP_NUM_THREADS="1"
+    )
 
 
 def probe(backend: str) -> Probe:
     """Render one small frame with ``backend`` in a child process."""
     start = time.perf_counter()
-    command = [sys.executable, "-m", __name__]
+    command = processes.python("-m", __name__)
     try:
         done = subprocess.run(
-            command, env=environment(backend), capture_output=True, text=True, timeout=_PATIENCE, check=False
+            command,
+            env=environment(backend),
+            cwd="/",
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return Probe(backend, False, "", _PATIENCE, f"no frame within {_PATIENCE:.0f} s")

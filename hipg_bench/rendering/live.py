@@ -23,6 +23,7 @@ from typing import IO, Literal, cast
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hipg_bench import processes
 from hipg_bench.errors import HipgError, RenderError
 from hipg_bench.rendering import gl
 from hipg_bench.spec import Params, TaskSpec
@@ -118,8 +119,9 @@ class _Child:
         self._where = f"{job.spec.task}: {backend}"
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __spec__.name, job.model_dump_json()],
+            processes.python("-m", __spec__.name, job.model_dump_json()),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, env=gl.environment(backend),
+            cwd="/",
         )  # fmt: skip
         self._mouth = cast("IO[bytes]", self._process.stdin)
         self._ear = cast("IO[bytes]", self._process.stdout)

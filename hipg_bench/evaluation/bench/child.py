@@ -7,7 +7,6 @@ before it has its environment variables and knows what to measure.
 from __future__ import annotations
 
 import dataclasses
-import os
 import pickle
 import resource
 import subprocess
@@ -17,6 +16,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hipg_bench import processes
 from hipg_bench.errors import HipgError
 
 
@@ -47,8 +47,8 @@ def run(job: Job) -> list[Any]:
         asked, answer = Path(folder) / "job", Path(folder) / "rows"
         asked.write_bytes(pickle.dumps((job.function, job.arguments)))
         done = subprocess.run(
-            [sys.executable, "-m", __spec__.name, str(asked), str(answer)],
-            env={**os.environ, **job.environment},
+            processes.python("-m", __spec__.name, str(asked), str(answer)),
+            env=processes.environment(**job.environment), cwd="/",
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
         if done.returncode != 0:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import collections
 import dataclasses
 import subprocess
-import sys
 from collections.abc import Callable, Mapping
 
+from hipg_bench import processes
 from hipg_bench.evaluation.bench.timing import Contender, in_turn
 
 _NAMED = 4
@@ -53,14 +53,14 @@ def start_times(seconds: float, code: Mapping[str, str] = CODE) -> list[Start]:
 
 
 def _process(code: str) -> Callable[[], object]:
-    command = [sys.executable, "-c", code]
-    return lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    command = processes.python("-c", code)
+    return lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=processes.environment())
 
 
 def _slowest_imports(code: str) -> str:
     """Packages by the time that their modules' own code took, from ``-X importtime``."""
     said = subprocess.run(
-        [sys.executable, "-X", "importtime", "-c", code],
+        processes.python("-X", "importtime", "-c", code), env=processes.environment(),
         check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
     ).stderr  # fmt: skip
     own: dict[str, float] = collections.defaultdict(float)
