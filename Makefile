@@ -53,7 +53,7 @@ test-long: $(READY) ## what takes long: evaluations killed twenty times, whole s
 	$(BIN)/pytest -m long $(ARGS)
 
 freeze: $(READY) ## after a wanted change: the golden episodes must hold, then the suite version is frozen anew
-	$(BIN)/pytest tests/test_golden.py
+	$(BIN)/pytest tests/test_golden.py --strict-golden
 	$(BIN)/hipg-bench suite freeze
 
 golden: $(READY) ## record the golden episodes anew, after a wanted change of behaviour

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench import episode
+from hipg_bench.arguments import MOST_EPISODE, MOST_SEED, numbers, whole
 from hipg_bench.episode import NEVER, memory_fields
 from hipg_bench.errors import ActionError, HipgError
 from hipg_bench.families.family import Family, Harm
@@ -90,19 +91,31 @@ class BatchEnv:
         self.metrics = (*episode.METRICS, *family.metrics)
         self.decimation = family.physics_steps
         self.model = world_model(spec, family)
-        self._sim = Sim(
-            self.model,
-            num_envs,
-            memory_fields(spec, family),
-            decimation=family.physics_steps,
-            threads=threads,
-        )
+        self._threads = threads
+        self._sim = self._new_sim()
         self._seed = seed
         self._autoreset = autoreset
         self._next_episode = 0
         self._now: Any = None
         self._waiting = np.ones(num_envs, bool)
         self._closed = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What pickle and deepcopy keep: how it was built, and the worlds as they are."""
+        return {
+            "built": (self.spec, self.family, self.num_envs, self._seed),
+            "options": {"threads": self._threads, "autoreset": self._autoreset},
+            "rows": self.rows, "waiting": self._waiting, "next_episode": self._next_episode,
+            "begun": self._now is not None, "closed": self._closed,
+        }  # fmt: skip
+
+    def __setstate__(self, kept: Mapping[str, Any]) -> None:
+        """Go on where the original was."""
+        self.__init__(*kept["built"], **kept["options"])
+        self._next_episode, self._closed = kept["next_episode"], kept["closed"]
+        if kept["begun"]:
+            self._take_over(kept["rows"])
+            self._waiting = np.array(kept["waiting"])
 
     def reset(
         self,
@@ -122,16 +135,19 @@ class BatchEnv:
             What the agents see now, in all worlds; reward 0.
 
         Raises:
-            HipgError: episodes or a seed below 0, or worlds outside 0..B-1 or named twice.
+            HipgError: episodes outside 0..2^53 - 1, a seed outside 0..2^64 - 1, or worlds outside 0..B-1 or
+                named twice.
         """
         self._check_open()
         ids = self._checked_worlds(np.arange(self.num_envs) if worlds is None else worlds)
+        if seed is not None:
+            seed = whole(seed, f"{self.spec.task}: seed", 0, MOST_SEED)
         first = self._next_episode if seed is None else 0
-        episodes = first + np.arange(len(ids)) if episode_id is None else np.asarray(episode_id, np.int64)
-        if episodes.shape != ids.shape or (episodes < 0).any() or (seed is not None and seed < 0):
+        episodes = first + np.arange(len(ids)) if episode_id is None else self._checked_episodes(episode_id)
+        if episodes.shape != ids.shape:
             raise HipgError(
-                f"{self.spec.task}: {len(ids)} episode ids >= 0 and a seed >= 0 are allowed, "
-                f"got {episodes.tolist()} and {seed}"
+                f"{self.spec.task}: {len(ids)} episode ids are allowed, one for each world, "
+                f"got {episodes.tolist()}"
             )
         if seed is not None:
             self._seed, self._next_episode = seed, 0
@@ -347,7 +363,7 @@ class BatchEnv:
                 f"{self.spec.task}: env {int(self._waiting.argmax())} is waiting for reset(), "
                 f"its episode is over or has not begun"
             )
-        action = np.asarray(action, np.float64)
+        action = numbers(action, self.spec.task, whose=" as actions").astype(np.float64, copy=False)
         expected = (self.num_envs, self.num_agents, self.action_size)
         if action.shape != expected:
             raise ActionError(
@@ -355,7 +371,9 @@ class BatchEnv:
             )
         alive = self._sim.field["health"] > 0
         # a sum is finite only if all its terms are
-        if not np.isfinite(action.sum()):
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(action.sum())
+        if not finite:
             self._refuse_infinite(action, alive)
         if self.spec.clip_actions:
             action = action.clip(-1.0, 1.0)
@@ -375,7 +393,7 @@ class BatchEnv:
             )
 
     def _checked_worlds(self, worlds: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-        worlds = np.atleast_1d(np.asarray(worlds))
+        worlds = np.atleast_1d(self._checked_integers(worlds, "worlds"))
         inside = (worlds >= 0) & (worlds < self.num_envs)
         if not inside.all() or len(np.unique(worlds)) < len(worlds):
             raise HipgError(
@@ -384,9 +402,41 @@ class BatchEnv:
             )
         return worlds
 
+    def _checked_episodes(self, episode_id: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+        episodes = np.atleast_1d(self._checked_integers(episode_id, "episode ids"))
+        if (episodes < 0).any() or (episodes > MOST_EPISODE).any():
+            raise HipgError(
+                f"{self.spec.task}: episode ids in 0..2^53 - 1 are allowed, got {episodes.tolist()}"
+            )
+        return episodes
+
+    def _checked_integers(self, values: Any, what: str) -> Int[np.ndarray, "..."]:
+        array = numbers(values, self.spec.task, whose=f" as {what}")
+        if array.dtype.kind not in "iu" and array.size:
+            raise HipgError(f"{self.spec.task}: whole numbers are allowed as {what}, got {array.dtype}")
+        if array.dtype.kind == "u" and array.size and array.max() > MOST_EPISODE:
+            raise HipgError(f"{self.spec.task}: {what} up to 2^53 - 1 are allowed, got {array.tolist()}")
+        return array.astype(np.int64)
+
     def _check_open(self) -> None:
         if self._closed:
             raise HipgError(f"{self.spec.task}: this environment is closed")
+        if self._sim.lost:
+            rows = self._sim.rows.copy()
+            self._sim = self._new_sim()
+            if self._now is not None:
+                self._take_over(rows)
+
+    def _new_sim(self) -> Sim:
+        fields = memory_fields(self.spec, self.family)
+        return Sim(self.model, self.num_envs, fields, decimation=self.decimation, threads=self._threads)
+
+    def _take_over(self, rows: Float[np.ndarray, "B R"]) -> None:
+        """Go on from rows that were saved a moment ago; who waits for reset goes on waiting."""
+        self._sim.rows[:] = rows
+        self._sim.disable(self._sim.field["health"] == 0)
+        self._now = self.family.read(self._sim)
+        self._perceive(self._now)
 
 
 __all__ = ["NEVER", "BatchEnv", "Step", "world_model"]

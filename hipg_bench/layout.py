@@ -14,6 +14,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+SHARE, UNIT = (0.0, 1.0), (-1.0, 1.0)
+"""Limits of flags and health, and of directions and actions."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Block:
@@ -25,6 +28,7 @@ class Block:
         unit: ``m``, ``m/s``, ``rad``, ``1`` for pure numbers.
         frame: ``world``, ``own`` (relative to the observer), ``body``, or ``-``.
         visible: when the entries hold something; at other times they are 0.
+        limits: the least and the largest value.
     """
 
     name: str
@@ -32,6 +36,7 @@ class Block:
     unit: str
     frame: str = "-"
     visible: str = "always"
+    limits: tuple[float, float] = (-math.inf, math.inf)
 
     @property
     def size(self) -> int:
@@ -57,6 +62,13 @@ class Layout:
         return {
             block.name: slice(end - block.size, end) for block, end in zip(self.blocks, ends, strict=True)
         }
+
+    @functools.cached_property
+    def limits(self) -> tuple[Float[np.ndarray, "size"], Float[np.ndarray, "size"]]:
+        """The least and the largest value of every number of the flat vector, float32."""
+        sizes = [block.size for block in self.blocks]
+        low, high = zip(*(block.limits for block in self.blocks), strict=True)
+        return np.repeat(np.array(low, np.float32), sizes), np.repeat(np.array(high, np.float32), sizes)
 
     @functools.cached_property
     def record(self) -> np.dtype[np.void]:

@@ -15,6 +15,8 @@ from concurrent.futures import ThreadPoolExecutor
 from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
+from hipg_bench.processes import usable_cores
+
 _WORTH = 128
 """Worlds per thread from which on another thread pays."""
 
@@ -68,7 +70,7 @@ def on_threads(work: Callable[[slice], None], worlds: int, threads: int) -> None
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="hipg-worlds")
+    return ThreadPoolExecutor(usable_cores(), thread_name_prefix="hipg-worlds")
 
 
 if hasattr(os, "register_at_fork"):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import os
 import sys
 from collections.abc import Generator
@@ -31,6 +32,31 @@ def environment(**changes: str) -> dict[str, str]:
     own = {**os.environ, "PYTHONSAFEPATH": "1", **changes}
     absolute = [path for path in own.pop("PYTHONPATH", "").split(os.pathsep) if os.path.isabs(path)]
     return {**own, "PYTHONPATH": os.pathsep.join(absolute)} if absolute else own
+
+
+def usable_cores() -> int:
+    """Cores that this process may use: those it is bound to, as far as its container's quota goes."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, _quota() or cores))
+
+
+def _quota() -> int | None:
+    """Cores' worth of time that a container may use, rounded up; None where there is no limit."""
+    old = "/sys/fs/cgroup/cpu/cpu.cfs_{}_us"
+    text = _read("/sys/fs/cgroup/cpu.max") or f"{_read(old.format('quota'))} {_read(old.format('period'))}"
+    try:
+        quota, period = (float(part) for part in text.split())
+    except ValueError:  # no file, or "max": no limit
+        return None
+    return math.ceil(quota / period) if quota > 0 and period > 0 else None
+
+
+def _read(path: str) -> str:
+    try:
+        with open(path, encoding="ascii") as file:
+            return file.read().strip()
+    except OSError:
+        return ""
 
 
 def leave_out_the_working_folder() -> None:

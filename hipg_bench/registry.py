@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from hipg_bench import spec as specs
+from hipg_bench.arguments import seed_or_entropy, whole
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import SpecError, UnknownNameError, hint
 from hipg_bench.families.family import Family
@@ -26,6 +27,9 @@ FAMILIES: dict[str, Callable[[TaskSpec], Family]] = {
     "paper_comm": PaperComm,
 }
 """Name in a task file to the class with its rules; one of your own is added here."""
+
+
+_MOST_THREADS = 1024
 
 
 @functools.cache
@@ -65,7 +69,7 @@ def family_of(spec: TaskSpec) -> Family:
 def make(
     task: str | TaskSpec,
     num_envs: int = 1,
-    seed: int = 0,
+    seed: int | None = 0,
     *,
     threads: int = 0,
     autoreset: bool = True,
@@ -76,18 +80,19 @@ def make(
     Args:
         task: a name, or a spec of your own.
         num_envs: B >= 1.
-        seed: >= 0; with the episode id it fixes all chance.
-        threads: physics threads; 0 for all cores. Results do not depend on it.
+        seed: in 0..2^64 - 1; with the episode id it fixes all chance. None draws one.
+        threads: physics threads; 0 for all cores that this process may use. Results do not depend on it.
         autoreset: a world whose episode ends starts the next in the same step; else it waits for ``reset``.
         **overrides: spec fields (``num_agents``, ``horizon``, ...), family numbers, or ``weights``.
 
     Raises:
         UnknownNameError: no such task.
-        SpecError: an override, ``num_envs`` or ``seed`` that is not allowed.
+        SpecError: an override, ``num_envs``, ``seed`` or ``threads`` that is not allowed.
     """
     spec = task_spec(task) if isinstance(task, str) else task
     if overrides:
         spec = spec.override(**overrides)
-    if num_envs < 1 or seed < 0:
-        raise SpecError(f"{spec.task}: num_envs >= 1 and seed >= 0 are allowed, got {num_envs} and {seed}")
+    num_envs = whole(num_envs, f"{spec.task}: num_envs", 1)
+    threads = whole(threads, f"{spec.task}: threads", 0, _MOST_THREADS)
+    seed = seed_or_entropy(seed, f"{spec.task}: seed")
     return BatchEnv(spec, family_of(spec), num_envs, seed, threads=threads, autoreset=autoreset)

@@ -6,12 +6,17 @@ remembers live in ``userdata``. Copying a row is snapshot, restore, fork, replay
 
 from __future__ import annotations
 
+import ctypes
+import os
+import weakref
 from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from mujoco.batch import Batch
+
+from hipg_bench.processes import usable_cores
 
 _BAD_PHYSICS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 """Warnings of positions, velocities or accelerations that are not numbers, or huge."""
@@ -21,6 +26,8 @@ class Sim:
     """B worlds of one model.
 
     Attributes:
+        lost: whether this is a copy in a forked process, where the engine's threads are not: its rows can be
+            read, and nothing else may be done with it.
         model: the compiled model; ``nuserdata`` is the sum of ``fields``.
         control: (B, nu) live view of the actuators' inputs.
         position, velocity: (B, nq), (B, nv) live views of the generalised state.
@@ -45,12 +52,14 @@ class Sim:
             num_envs: B.
             fields: name to numbers kept per world in ``userdata``.
             decimation: physics steps per control step.
-            threads: 0 for all cores.
+            threads: 0 for all cores that this process may use.
         """
         # a diverged world must keep its row: the environment ends its episode, MuJoCo must not reset it
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.model = model
-        self.batch = Batch(model, num_envs, threads)
+        self.lost = False
+        self.batch = Batch(model, num_envs, threads or usable_cores())
+        _here.add(self)
         self._decimation = decimation
         self.control = self.batch.bind("ctrl")
         self.position = self.batch.bind("qpos")
@@ -124,3 +133,21 @@ class Sim:
     def userdata_of(self, rows: Float[np.ndarray, "n R"], name: str) -> Float[np.ndarray, "n size"]:
         """View of one remembered field in saved rows."""
         return rows[:, self._userdata_start :][:, self._columns[name]]
+
+
+_here = weakref.WeakSet[Sim]()
+"""What a fork leaves without threads."""
+
+
+def _lose_threads() -> None:
+    """After a fork, in the child: the engine would wait for ever for threads that were not copied.
+
+    It does so when it is destroyed, too; hence one reference more, which is never given back.
+    """
+    for sim in _here:
+        sim.lost = True
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(sim.batch))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_lose_threads)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -21,9 +22,9 @@ M = TypeVar("M", bound=pydantic.BaseModel)
 
 
 class Params(pydantic.BaseModel):
-    """Base of every family's numbers: frozen, no unknown fields."""
+    """Base of every family's numbers: frozen, finite, no unknown fields."""
 
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Anchor(Params):
@@ -131,6 +132,8 @@ class TaskSpec(Params):
             if name in own:
                 values[name] = value
             elif name == "weights":
+                if not isinstance(value, Mapping):
+                    raise SpecError(f"{self.task}: weights = {value!r} is refused: a mapping is allowed")
                 unknown = set(value) - set(self.weights)
                 if unknown:
                     raise SpecError(

@@ -10,6 +10,7 @@ import time
 import pytest
 
 from hipg_bench import make, task_spec, tasks
+from hipg_bench.paths import LOCK, PARTIAL
 from hipg_bench.rendering import gl
 
 # a test run in the background ignores SIGINT, and so would its children
@@ -87,7 +88,9 @@ def test_evaluate_end_to_end(tmp_path):
     assert folder.name.startswith("random-")
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert names == {
-        "run.json", "results.json", "report.html", f"episodes/{TASK}.jsonl", "episodes/multiwalker-3.jsonl",
+        "run.json", LOCK, "results.json", "report.html",
+        f"episodes/{TASK}.jsonl", "episodes/multiwalker-3.jsonl",
+        f"episodes/.{TASK}.jsonl.sha256", "episodes/.multiwalker-3.jsonl.sha256",
     }  # fmt: skip
     results = json.loads((folder / "results.json").read_text())
     assert [task["task"] for task in results["tasks"]] == [TASK, "multiwalker-3"]
@@ -146,7 +149,7 @@ def test_interrupted_then_resumed_gives_the_same_rows(tmp_path, how):
     if how == signal.SIGINT:
         assert child.returncode == 130
         assert "Traceback" not in said
-        assert not list((tmp_path / "cut").rglob(".*"))
+        assert not list((tmp_path / "cut").rglob(f"{PARTIAL}*"))
     partial = rows.read_text()
     assert partial.endswith("}\n")
     assert partial.count("\n") < 200

@@ -16,7 +16,7 @@ from hipg_bench.errors import BundleError, HipgError, ResumeError
 from hipg_bench.evaluation import calibration, films, report, runner
 from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.evaluation.results import aggregate, summarise
-from hipg_bench.paths import data_folder
+from hipg_bench.paths import PARTIAL, data_folder
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.simple import Constant, Random
 from hipg_bench.rendering import gl
@@ -148,7 +148,7 @@ def test_interrupted_and_resumed_gives_the_same_bytes(tmp_path):
     for stop in (30, 75, 100):
         with pytest.raises(PlugError):
             runner.evaluate(agent, tasks, tmp_path / "parts", plan, progress=stop_after(stop))
-        assert not list((tmp_path / "parts").rglob(".*"))
+        assert not list((tmp_path / "parts").rglob(f"{PARTIAL}*"))
     # resumed with another batch size, too
     runner.evaluate(agent, tasks, tmp_path / "parts", dataclasses.replace(plan, num_envs=64))
     for task in (TASK, "coop_nav-3"):

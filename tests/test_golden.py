@@ -1,7 +1,7 @@
 """Two short episodes of every task, recorded: behaviour changes on purpose or not at all.
 
-`make golden` records them anew. Results are bit for bit the same only on the same engine, array library
-and kind of processor, so elsewhere these tests skip and say why.
+`make golden` records them anew. Results are bit for bit the same with the pinned engine and array library on
+the machines of `hipg_bench.evaluation.machines`; on others these tests skip and say why.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +19,16 @@ from play import actions, strike
 
 import hipg_bench
 from hipg_bench import make, task_spec
+from hipg_bench.evaluation import machines
 
 FOLDER = Path(__file__).parent / "golden"
 STEPS = 40
 TASKS = sorted(hipg_bench.tasks())
 
 
-def machine() -> dict[str, str]:
-    """What the last bits of a result depend on beside the code."""
-    wanted = ("vendor_id", "cpu family", "model", "model name")
-    found = {"machine": platform.machine()}
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().split("\n\n")[0].splitlines():
-            name, _, value = line.partition(":")
-            if name.strip() in wanted:
-                found[name.strip()] = value.strip()
-            if name.strip() == "flags":
-                vectors = sorted(flag for flag in value.split() if flag in ("fma", "avx2", "avx512f"))
-                found["vectors"] = " ".join(vectors)
-    libc = " ".join(platform.libc_ver())
-    return {"mujoco": mujoco.__version__, "numpy": np.__version__, "libc": libc, **found}
+def versions() -> dict[str, str]:
+    """What the last bits of a result depend on beside the code and the machine."""
+    return {"mujoco": mujoco.__version__, "numpy": np.__version__}
 
 
 def episodes(task: str) -> dict[str, Any]:
@@ -74,7 +62,7 @@ def test_golden_episodes(task: str, request: pytest.FixtureRequest):
     path = FOLDER / f"{task}.json"
     if request.config.getoption("--record-golden"):
         temporary = path.with_suffix(".tmp")
-        temporary.write_text(json.dumps({"machine": machine(), **episodes(task)}, indent=2) + "\n")
+        temporary.write_text(json.dumps({"versions": versions(), **episodes(task)}, indent=2) + "\n")
         os.replace(temporary, path)
         pytest.skip("recorded")
     assert path.exists(), f"{path} is missing: record it with `make golden`"
@@ -83,9 +71,12 @@ def test_golden_episodes(task: str, request: pytest.FixtureRequest):
     assert golden["fingerprint"] == spec.fingerprint, (
         f"the numbers of {task} changed: raise its version, then `make golden`"
     )
-    here, there = machine(), golden.pop("machine")
-    if here != there:
-        pytest.skip(f"recorded on {there}, this is {here}")
+    assert golden.pop("versions") == versions(), "install the pinned versions: make setup"
+    differs = machines.why_rows_may_differ()
+    if differs and request.config.getoption("--strict-golden"):
+        pytest.fail(f"{differs}: freeze the suite on such a machine")
+    if differs:
+        pytest.skip(differs)
     assert episodes(task) == golden, f"{task} behaves differently: if that is wanted, `make golden`"
 
 

@@ -91,4 +91,4 @@ def test_what_the_page_exports_can_be_read(tmp_path, monkeypatch):
     }
     assert {(one.observation_size, one.action_size) for one in networks.values()} == {(51, 3)}
     assert isinstance(networks["gru"].form, GRUForm)
-    check_graph(tmp_path / "onnx_agent.onnx", 51, 3)
+    check_graph(tmp_path / "onnx_agent.onnx", task_spec("hazard_nav-4"))

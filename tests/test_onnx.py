@@ -1,6 +1,7 @@
 """ONNX agents act as the graph does, one agent at a time in a sandbox; those that can do more are refused."""
 
 import contextlib
+import resource
 import warnings
 
 import numpy as np
@@ -14,10 +15,11 @@ from hipg_bench import make, task_spec
 from hipg_bench.errors import AgentFailure, BundleError
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.graph import check_graph
+from hipg_bench.sandbox.inside.graph_checker import GraphError, read_graph
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
-from onnx import TensorProto, helper  # noqa: E402
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 SPEC = task_spec("hazard_nav-4")
 SIZE = make(SPEC).layout.observation.size
@@ -200,12 +202,43 @@ def test_a_damaged_graph_is_refused_or_looks_sound(recurrent, tmp_path, data):
     for _ in range(data.draw(st.integers(1, 4))):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     (tmp_path / "one.onnx").write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
-    with contextlib.suppress(BundleError):
-        check_graph(tmp_path / "one.onnx", SIZE, 3)
+    setup = {"folder": tmp_path, "options": {"file": "one.onnx"}}
+    with contextlib.suppress(GraphError):
+        read_graph(setup | {"task": {"observation_size": SIZE, "action_size": 3}})
 
 
 def test_a_large_file_is_refused_before_it_is_read(tmp_path):
     with (tmp_path / "large.onnx").open("wb") as file:
         file.truncate(10**9)
     with pytest.raises(BundleError, match="at most 64000000 bytes are allowed, got 1000000000"):
-        check_graph(tmp_path / "large.onnx", SIZE, 3)
+        check_graph(tmp_path / "large.onnx", SPEC)
+
+
+def test_a_layer_that_drops_out_while_it_plays_is_refused(tmp_path):
+    """Dropout in training mode is chance; in evaluation mode, without the third input, it is not."""
+    ratio, training = (
+        numpy_helper.from_array(np.asarray(value), name)
+        for name, value in (("ratio", np.float32(0.5)), ("training", np.bool_(True)))
+    )
+    nodes = [
+        helper.make_node("MatMul", ["observation", "weight"], ["x"]),
+        helper.make_node("Dropout", ["x", "ratio", "training"], ["action"]),
+    ]
+    model = linear(nodes)
+    model.graph.initializer.extend([ratio, training])
+    with pytest.raises(BundleError, match="'Dropout' is not allowed: actions must not be drawn at random"):
+        bundle(tmp_path, model).policy(SPEC)
+
+
+def test_reading_a_graph_takes_no_memory_here(tmp_path):
+    """Eight million empty bytes of nodes become some 600 MB of objects: in the child."""
+    body = b"\x0a\x00" * 4_000_000
+    length, size = b"", len(body)
+    while size:
+        length += bytes([size & 127 | (128 if size > 127 else 0)])
+        size >>= 7
+    (tmp_path / "bomb.onnx").write_bytes(b"\x3a" + length + body + b"\x42\x04\x0a\x00\x10\x11")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(BundleError):
+        check_graph(tmp_path / "bomb.onnx", SPEC)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB

@@ -12,6 +12,8 @@ import urllib.request
 import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 from test_verify import TASK, add, altered, network, zipped
 
 from hipg_bench.errors import BoardError
@@ -50,9 +52,13 @@ def hostile(folder):
 
 
 def with_seeds(folder, count):
-    """A method: the same weights as if they had been trained several times."""
+    """A method: weights that differ a little, as if they had been trained several times."""
+    first = folder / TASK / "seed0.safetensors"
+    with safe_open(first, "numpy") as file:
+        metadata = file.metadata()
     for seed in range(1, count):
-        shutil.copyfile(folder / TASK / "seed0.safetensors", folder / TASK / f"seed{seed}.safetensors")
+        tensors = {name: tensor * np.float32(1 + 0.01 * seed) for name, tensor in load_file(first).items()}
+        save_file(tensors, folder / TASK / f"seed{seed}.safetensors", metadata)
     return folder
 
 
@@ -76,20 +82,20 @@ def board(tmp_path_factory):
     package = zipped(hostile(place / "hostile"))
     with opened(package) as source:
         runner.evaluate(source.agent, MATCH.suite(), place / "claims" / "standard", MATCH.plan("standard"))
-    claims = altered(place / "claims", place / "evil", lambda row: row.update(end_reason=EVIL))
+    claims = altered(place / "claims", place / "evil", lambda row: row.update(end_reason=EVIL[:100]))
     add(board, package, Match((TASK,), ("standard",), episodes=6, threads=1), claims=claims)
     salt = read_salt(board.root, place / "salt")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "differences", list)
-        assert verify(board, "newcomer", salt, threads=1).outcome == "verified"
-        assert verify(board, "hostile", salt, threads=1).outcome == "mismatch"
+        assert verify(board, "newcomer", salt, place / "private", threads=1).outcome == "verified"
+        assert verify(board, "hostile", salt, place / "private", threads=1).outcome == "mismatch"
     return board
 
 
 @pytest.fixture(scope="module")
 def site(board, tmp_path_factory):
     out = tmp_path_factory.mktemp("built") / "site"
-    assert build(board, out) == 5
+    assert len(build(board, out).entries) == 5
     return out
 
 
@@ -337,9 +343,9 @@ def test_the_data_for_programs_are_the_rows(board, site):
     entries = {one.name: one for one in read_board(board)}
     found = json.loads((site / "data" / "marl_eval_standard.json").read_text())["hipg_bench"][TASK]
     assert set(found) == set(entries)
-    for name, worlds in (("newcomer", "hidden"), ("zero", "public")):
+    for name in ("newcomer", "zero"):
         values = found[name]["seed_0"]["absolute_metrics"]["return"]
-        assert values == [row["return"] for row in entries[name].rows(worlds, "standard", TASK)]
+        assert values == [row["return"] for row in entries[name].rows("public", "standard", TASK)]
     lines = json.loads((site / "data" / "board.json").read_text())
     (line,) = (
         one for one in lines if (one["split"], one["family"], one["name"]) == ("standard", "all", "steady")
@@ -381,3 +387,40 @@ def test_serving_is_for_this_machine_only(board):
                 socket.create_connection(("127.0.0.2", port), timeout=5).close()
         finally:
             server.kill()
+
+
+def test_a_damaged_entry_is_left_out_and_named(board, tmp_path):
+    shutil.copytree(board.root, tmp_path / "board")
+    folder = tmp_path / "board" / "entries" / "steady" / "standard"
+    (folder / "results.json").write_text("{}")
+    view = build(Board(tmp_path / "board"), tmp_path / "site")
+    assert len(view.entries) == 4
+    assert list(view.left_out) == ["steady"]
+    front = (tmp_path / "site" / "index.html").read_text()
+    assert "Left out, because their files are damaged: steady." in front
+    assert "newcomer" in front
+
+
+def test_files_that_somebody_added_to_a_site_stay(board, tmp_path):
+    site = tmp_path / "site"
+    build(board, site)
+    (site / "CNAME").write_text("bench.example.org")
+    (site / ".git").mkdir()
+    (site / ".git" / "config").write_text("mine")
+    build(board, site)
+    assert (site / "CNAME").read_text() == "bench.example.org"
+    assert (site / ".git" / "config").read_text() == "mine"
+    assert (site / "index.html").exists()
+
+
+@pytest.mark.parametrize(
+    "curve", ["steps,return\n1,2\n", "steps,return\n1,1e308\n2,-1e308\n", "steps,return\n5,1\n1,2\n"]
+)
+def test_an_odd_learning_curve_breaks_no_page(tmp_path, curve):
+    folder = network(tmp_path / "odd", "odd")
+    (folder / TASK / "seed0.curve.csv").write_text(curve)
+    own = Board(tmp_path / "board")
+    add(own, folder, Match((TASK,), ("standard",), episodes=3, threads=1))
+    assert len(build(own, tmp_path / "site").entries) == 1
+    page = (tmp_path / "site/agents/odd.html").read_text()
+    assert not re.search(r'[ "]nan[ ",]', page.lower())

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import hipg_bench
+from hipg_bench.paths import PARTIAL
 
 ROOT = Path(hipg_bench.__file__).resolve().parents[1]
 
@@ -80,7 +81,7 @@ def test_killed_and_resumed_the_rows_are_the_same(tmp_path):
     struck = run_killed(tmp_path / "parts", seconds, 3, *SMALL, "--num-envs", "8")
     assert struck >= 1
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
-    assert not list((tmp_path / "parts").rglob(".*"))
+    assert not list((tmp_path / "parts").rglob(f"{PARTIAL}*"))
 
 
 @pytest.mark.long

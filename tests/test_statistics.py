@@ -43,6 +43,23 @@ def test_iqm_interval_matches_scipy_when_each_run_is_one_number():
     assert np.abs(np.array(interval) - expected).max() < 0.04 * (expected.high - expected.low)
 
 
+def test_many_runs_of_one_task_do_not_outweigh_the_others():
+    """Seven tasks, one of them played 25 times at 0.85: six sevenths of the weight are zeros."""
+    tasks = [np.full(25, 0.85), *(np.zeros(1) for _ in range(6))]
+    # a quarter, 43 of 175, is cut above, and the 25 lie in it
+    assert statistics.iqm(tasks) == 0.0
+    # profile: 0.85 is above 0.5 in one task of seven
+    np.testing.assert_allclose(statistics.profile(tasks, np.array([-0.1, 0.5])), [1.0, 1 / 7])
+
+
+def test_iqm_of_unequal_runs_is_that_of_repeated_ones():
+    """Two runs of one task and three of another weigh as three copies of the two, and two of the three."""
+    two, three = np.array([0.1, 0.7]), np.array([0.2, 0.3, 0.9])
+    repeated = np.sort(np.concatenate([np.repeat(two, 3), np.repeat(three, 2)]))
+    # with three runs at most, 6 // 4 = 1 of 6 equal parts is cut at each end: two of the twelve copies
+    assert statistics.iqm([two, three]) == pytest.approx(repeated[2:-2].mean())
+
+
 def test_iqm_is_the_mean_of_the_middle_half():
     # means 0, 1, 2, 100: a quarter off each end leaves 1 and 2
     tasks = [[np.array([value, value])] for value in (100.0, 0.0, 2.0, 1.0)]
@@ -197,8 +214,9 @@ def test_a_suite_of_methods_is_summed_up_by_runs():
     ]
     low, high = rows_of(range(1, 6), [-0.1, 0.1]), rows_of(range(1, 6), [2.0])
     whole = aggregate([(specs[0], low), (specs[1], high), (specs[2], [])])
-    # cut to 1.5, b is 1.5 five times; of 0.1 .. 0.5, five 1.5 and one 0 (11 in all) two go at each end
-    assert whole["score_iqm"] == pytest.approx((0.2 + 0.3 + 0.4 + 0.5 + 3 * 1.5) / 7)
+    # cut to 1.5, b is 1.5 five times; the unplayed task weighs as much as five runs of 0;
+    # three of 15 go at each end
+    assert whole["score_iqm"] == pytest.approx((0 + 0 + 0.1 + 0.2 + 0.3 + 0.4 + 0.5 + 1.5 + 1.5) / 9)
     assert whole["score_mean"] == pytest.approx((0.3 + 1.5 + 0.0) / 3)
     assert whole["score_median"] == pytest.approx(0.3)
     assert whole["optimality_gap"] == pytest.approx(1 - (0.3 + 1.0 + 0.0) / 3)
@@ -207,7 +225,7 @@ def test_a_suite_of_methods_is_summed_up_by_runs():
     # only a varies: its mean of five draws from 0.1 .. 0.5 has deviation sqrt(0.02 / 5), a third of it counts
     assert high_end - low_end == pytest.approx(2 * 1.96 * np.sqrt(0.02 / 5) / 3, rel=0.1)
     share = dict(zip(whole["profile"]["thresholds"], whole["profile"]["share"], strict=True))
-    assert (share[-0.5], share[0.25], share[1.5]) == (1.0, pytest.approx(8 / 11), 0.0)
+    assert (share[-0.5], share[0.25], share[1.5]) == (1.0, pytest.approx((3 / 5 + 1 + 0) / 3), 0.0)
     # with fewer runs there is an interval over episodes, and no others
     few = aggregate([(specs[0], rows_of([1], [-0.1, 0.1]))])
     assert few["score_mean_ci95"] is None

@@ -19,6 +19,7 @@ from hipg_bench.cli import app
 from hipg_bench.errors import ResumeError, SpecError
 from hipg_bench.learning import sweep
 from hipg_bench.learning.run import train
+from hipg_bench.paths import LOCK
 from hipg_bench.registry import tagged
 
 ROOT = Path(hipg_bench.__file__).resolve().parents[1]
@@ -73,7 +74,7 @@ def test_a_killed_sweep_leaves_nobody_training_and_goes_on(tmp_path: Path) -> No
         train(runs[0].settings, runs[0].out, command="beside it")
     process.kill()
     process.wait()
-    lock = FileLock(runs[0].out / ".lock")
+    lock = FileLock(runs[0].out / LOCK)
     lock.acquire(timeout=60)  # the worker lets go
     lock.release()
     assert 0 < runs[0].done < 4000

@@ -10,8 +10,10 @@ import sys
 import time
 
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
-from hipg_bench.errors import BoardError, BundleError, ResumeError
+from hipg_bench.errors import BoardError, BundleError, ResumeError, SpecError
 from hipg_bench.evaluation import protocol, runner
 from hipg_bench.leaderboard import adding
 from hipg_bench.leaderboard.board import Board
@@ -30,6 +32,7 @@ TASK = "hazard_nav-4"
 MATCH = Match((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
 SHORT = Match((TASK,), ("standard",), episodes=3, threads=1)
 FROZEN = not protocol.differences()
+THANKS = 'authors = "A"\nlicense = "MIT"\n'
 SANDBOXED = any(trial.works for trial in choice.trials().values())
 
 
@@ -39,7 +42,7 @@ def network(folder, name="newcomer"):
     weights = data_folder("agents") / "mappo_minhealth" / TASK / "seed0.safetensors"
     shutil.copyfile(weights, folder / TASK / "seed0.safetensors")
     shutil.copyfile(weights.with_suffix(".curve.csv"), folder / TASK / "seed0.curve.csv")
-    (folder / "agent.toml").write_text(f'name = "{name}"\nsummary = "Learns"\nkind = "network"\n')
+    (folder / "agent.toml").write_text(f'name = "{name}"\nsummary = "Learns"\nkind = "network"\n{THANKS}')
     (folder / "README.md").write_text("# A newcomer\n")
     return folder
 
@@ -48,9 +51,10 @@ def python(folder, name, answer):
     """A submission of tier 2."""
     folder.mkdir()
     (folder / "agent.toml").write_text(
-        f'name = "{name}"\nsummary = "Acts"\nkind = "python"\nentry_point = "own:make_agent"\n'
+        f'name = "{name}"\nsummary = "Acts"\nkind = "python"\nentry_point = "own:make_agent"\n{THANKS}'
         f"[tasks]\n{TASK!r} = [0]\n"
     )
+    (folder / "README.md").write_text("# An agent\n")
     (folder / "own.py").write_text(
         "import numpy as np\n"
         "class Agent:\n"
@@ -78,10 +82,10 @@ def frozen(monkeypatch):
     monkeypatch.setattr(protocol, "differences", list)
 
 
-def test_a_tree_that_is_not_the_frozen_suite_verifies_nothing(board, salted, monkeypatch):
+def test_a_tree_that_is_not_the_frozen_suite_verifies_nothing(board, salted, tmp_path, monkeypatch):
     monkeypatch.setattr(protocol, "differences", lambda: ["tasks.x: floor was -1, is -2"])
     with pytest.raises(BoardError, match=r"the tree is not hipg-1.*floor was -1, is -2"):
-        verify(board, "newcomer", salted[1], threads=1)
+        verify(board, "newcomer", salted[1], tmp_path / "private", threads=1)
     assert board.entry("newcomer").verification is None
 
 
@@ -145,15 +149,21 @@ def test_a_zip_becomes_an_entry(salted):
     assert not list(board.root.rglob(".work"))
 
 
-def test_what_is_true_is_verified_on_hidden_worlds(board, salted):
+def test_what_is_true_is_verified_on_hidden_worlds(board, salted, tmp_path):
     _, salt, _ = salted
-    found = verify(board, "newcomer", salt, threads=1)
+    found = verify(board, "newcomer", salt, tmp_path / "private", threads=1)
     assert (found.outcome, found.sandbox, found.execution) == ("verified", "not needed", "decentralised")
     assert (found.compared, found.differing) == (12, 0)
     (shown,) = read_board(board)
     assert (shown.status, shown.worlds) == ("verified", "hidden")
     for split in MATCH.splits:
-        hidden, public = (shown.rows(worlds, split, TASK) for worlds in ("hidden", "public"))
+        public = shown.rows("public", split, TASK)
+        kept = tmp_path / "private" / "newcomer" / "v1" / f"hidden/{split}/episodes/{TASK}.jsonl.gz"
+        hidden = [json.loads(line) for line in unpack(kept).splitlines()]
+        assert (
+            hashlib.sha256(unpack(kept)).hexdigest()
+            == shown.entry.rows[f"hidden/{split}/episodes/{TASK}.jsonl.gz"]
+        )
         assert [row["eval_seed"] for row in public] == [1000] * 6
         # nobody learns which worlds they are
         assert [row["eval_seed"] for row in hidden] == [None] * 6
@@ -167,25 +177,35 @@ def test_what_is_true_is_verified_on_hidden_worlds(board, salted):
         unpack(path) if path.suffix == ".gz" else path.read_bytes()
         for path in board.root.rglob("*") if path.is_file()
     )  # fmt: skip
+    # what an agent does in a hidden world could tell what it saw there
+    assert not list(board.root.rglob("hidden/*/episodes"))
+    for row in hidden:
+        assert json.dumps(row["return"]).encode() not in published
+    result = json.loads((shown.folder / "hidden/standard/results.json").read_text())
+    scores = [run["score"] for task in result["tasks"] for run in task["runs"]]
+    assert scores == [float(f"{score:.3g}") for score in scores]
     seed = MATCH.plan("standard", salt).eval_seed(TASK, 0)
     assert salt.hex().encode() not in published
     assert str(seed).encode() not in published
     # verified twice, it is the same entry once, with no history
-    verify(board, "newcomer", salt, threads=1)
+    verify(board, "newcomer", salt, tmp_path / "private", threads=1)
     assert not (board.root / "history").exists()
 
 
 def test_after_the_salt_is_revealed_it_is_outdated(board, salted, tmp_path):
     _, salt, _ = salted
-    verify(board, "newcomer", salt, threads=1)
+    verify(board, "newcomer", salt, tmp_path / "private", threads=1)
     (tmp_path / "salt").write_text(salt.hex())
     (tmp_path / "salt").chmod(0o600)
     reveal_salt(board.root, tmp_path / "salt")
+    assert board.publish_rows(tmp_path / "private") == (2, [])
+    (shown,) = read_board(board)
+    assert len(shown.rows("hidden", "standard", TASK)) == 6
     assert read_board(board)[0].status == "outdated"
     with pytest.raises(BoardError, match="not the one"):
-        verify(board, "newcomer", salt, threads=1)
+        verify(board, "newcomer", salt, tmp_path / "private", threads=1)
     new_salt(board.root, tmp_path / "second", "hipg-1")
-    verify(board, "newcomer", read_salt(board.root, tmp_path / "second"), threads=1)
+    verify(board, "newcomer", read_salt(board.root, tmp_path / "second"), tmp_path / "private", threads=1)
     assert read_board(board)[0].status == "verified"
 
 
@@ -193,8 +213,42 @@ def test_true_claims_are_verified(tmp_path, salted, rows):
     board = Board(tmp_path / "board")
     new_salt(board.root, tmp_path / "salt", "hipg-1")
     assert add(board, salted[2], claims=rows).claimed
-    found = verify(board, "newcomer", read_salt(board.root, tmp_path / "salt"), threads=1)
+    found = verify(
+        board, "newcomer", read_salt(board.root, tmp_path / "salt"), tmp_path / "private", threads=1
+    )
     assert (found.outcome, found.compared) == ("verified", 12)
+
+
+def test_the_seed_that_an_agent_is_told_differs_at_each_verification():
+    """In hidden worlds: else a throw-away submission could learn to recognise them."""
+    salt = bytes(range(32))
+    plans = [MATCH.plan("standard", salt, luck) for luck in ("one|1|2026", "one|1|2027")]
+    assert len({plan.agent_seed(TASK, 0) for plan in plans}) == 2
+    assert len({plan.eval_seed(TASK, 0) for plan in plans}) == 1
+    assert MATCH.plan("standard").agent_seed(TASK, 0) == 1000
+
+
+def test_copies_of_one_training_are_not_several(tmp_path):
+    """Neither by content nor, where code hides it, by what they do."""
+    folder = network(tmp_path / "copied", "copied")
+    tensors = load_file(folder / TASK / "seed0.safetensors")
+    with safe_open(folder / TASK / "seed0.safetensors", "numpy") as file:
+        metadata = file.metadata()
+    save_file(tensors, folder / TASK / "seed1.safetensors", metadata | {"note": "another file"})
+    with pytest.raises(BundleError, match="training seeds 0 and 1 are the same policy"):
+        add(Board(tmp_path / "board"), folder)
+    (folder / TASK / "seed1.safetensors").rename(folder / TASK / "seed01.safetensors")
+    with pytest.raises(BundleError, match="without leading zeros, such as seed1"):
+        add(Board(tmp_path / "board"), folder)
+
+
+@pytest.mark.skipif(not SANDBOXED, reason="no sandbox works on this machine")
+def test_code_that_ignores_its_training_seed_was_trained_once(tmp_path):
+    folder = python(tmp_path / "one", "one", "np.tanh(observation[..., :3])")
+    card = (folder / "agent.toml").read_text().replace("= [0]", "= [0, 1]")
+    (folder / "agent.toml").write_text(card)
+    with pytest.raises(BundleError, match="training seeds 0 and 1 played alike in all 3 worlds"):
+        add(Board(tmp_path / "board"), folder, SHORT)
 
 
 def a_billionth(row):
@@ -210,7 +264,9 @@ def test_a_claim_that_is_a_little_untrue_is_caught(tmp_path, salted, rows, chang
     board = Board(tmp_path / "board")
     new_salt(board.root, tmp_path / "salt", "hipg-1")
     add(board, salted[2], claims=altered(rows, tmp_path / "claims", change))
-    found = verify(board, "newcomer", read_salt(board.root, tmp_path / "salt"), threads=1)
+    found = verify(
+        board, "newcomer", read_salt(board.root, tmp_path / "salt"), tmp_path / "private", threads=1
+    )
     assert (found.outcome, found.differing) == ("mismatch", 1)
     (difference,) = found.differences
     assert (difference.split, difference.task, difference.world) == ("standard", TASK, 4)
@@ -225,10 +281,10 @@ def test_a_claim_that_is_a_little_untrue_is_caught(tmp_path, salted, rows, chang
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda row: row.pop("survival"), "survival is nothing"),
-        (lambda row: row.update({"return": "high"}), "return is 'high'; int or float is allowed"),
-        (lambda row: row.update({"return": float("nan")}), "return is nan"),
-        (lambda row: row.update(world=-1), "eval_seed is 1000 there"),
+        (lambda row: row.pop("survival"), "survival is required and missing"),
+        (lambda row: row.update({"return": "high"}), "return = 'high' is refused"),
+        (lambda row: row.update({"return": float("nan")}), "is not JSON"),
+        (lambda row: row.update(world=-1), "world = -1 is refused"),
         (lambda row: row.update(policy="another"), "belongs to another evaluation"),
         (lambda row: row.update(versions={}), "belongs to another evaluation"),
     ],
@@ -236,13 +292,13 @@ def test_a_claim_that_is_a_little_untrue_is_caught(tmp_path, salted, rows, chang
 def test_claims_that_are_no_rows_are_refused_and_leave_nothing(tmp_path, salted, rows, change, message):
     board = Board(tmp_path / "board")
     claims = altered(rows, tmp_path / "claims", change)
-    with pytest.raises((BoardError, ResumeError), match=message):
+    with pytest.raises((SpecError, ResumeError), match=message):
         add(board, salted[2], claims=claims)
     assert board.names() == ()
-    assert not list(board.root.glob(".draft*"))
+    assert not list(board.root.glob(".hipg-bench-draft*"))
 
 
-def test_what_was_tampered_with_on_the_board_is_not_believed(board, salted):
+def test_what_was_tampered_with_on_the_board_is_not_believed(board, salted, tmp_path):
     _, salt, _ = salted
     folder = board.folder("newcomer")
     path = folder / "standard" / "episodes" / f"{TASK}.jsonl.gz"
@@ -251,11 +307,11 @@ def test_what_was_tampered_with_on_the_board_is_not_believed(board, salted):
     pack(text.replace(json.dumps(row["return"]).encode(), b"0.0"), path)
     with pytest.raises(BoardError, match="not what was entered"):
         read_board(board)[0].rows("public", "standard", TASK)
-    assert verify(board, "newcomer", salt, threads=1).outcome == "mismatch"
+    assert verify(board, "newcomer", salt, tmp_path / "private", threads=1).outcome == "mismatch"
     bundle = folder / "bundle.zip"
     bundle.write_bytes(bundle.read_bytes() + b"\0")
     with pytest.raises(BoardError, match="not what was entered"):
-        verify(board, "newcomer", salt, threads=1)
+        verify(board, "newcomer", salt, tmp_path / "private", threads=1)
 
 
 def test_bundles_that_may_not_be_entries(tmp_path, board):
@@ -285,7 +341,7 @@ def test_code_of_others_is_verified_in_the_sandbox_and_sharing_is_listed(tmp_pat
     for folder, execution in ((alone, "decentralised"), (shares, "centralised")):
         entry = add(board, zipped(folder), SHORT)
         assert entry.sandbox == choice.sandbox()
-        found = verify(board, folder.name, salt, threads=1)
+        found = verify(board, folder.name, salt, tmp_path / "private", threads=1)
         assert (found.outcome, found.sandbox, found.execution) == ("verified", choice.sandbox(), execution)
     assert any("acted on more than they observed" in reason for reason in found.reasons)
 
@@ -293,7 +349,7 @@ def test_code_of_others_is_verified_in_the_sandbox_and_sharing_is_listed(tmp_pat
 def test_trusted_code_is_never_verified(tmp_path, board, salted):
     folder = python(tmp_path / "trusted", "trusted", "observation[..., :3] * 0")
     assert add(board, folder, SHORT, trust=True).sandbox == "none"
-    found = verify(board, "trusted", salted[1], trust=True, threads=1)
+    found = verify(board, "trusted", salted[1], tmp_path / "private", trust=True, threads=1)
     assert (found.outcome, found.sandbox) == ("unsandboxed", "none")
     shown = next(one for one in read_board(board) if one.name == "trusted")
     # its hidden scores are not shown as if they were worth something
@@ -351,7 +407,7 @@ def test_adding_is_killed_and_two_add_at_once(tmp_path):
         command("add", packages[0], "--episodes", 3000, *OPTIONS, board.root), stderr=subprocess.DEVNULL
     )
     until = time.monotonic() + 60
-    while not list(board.root.glob(".draft-one-*/.work/standard/episodes/*.jsonl")):
+    while not list(board.root.glob(".hipg-bench-draft-one-*/.work/standard/episodes/*.jsonl")):
         assert long.poll() is None
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -364,5 +420,5 @@ def test_adding_is_killed_and_two_add_at_once(tmp_path):
     ]
     assert [child.wait(120) for child in children] == [0, 0]
     assert board.names() == ("one", "two")
-    assert not list(board.root.glob(".draft*"))
+    assert not list(board.root.glob(".hipg-bench-draft*"))
     assert load_agent("zero").name not in board.names()

@@ -214,7 +214,7 @@ def refuse(env: BatchEnv) -> list[tuple[Callable[[], object], str]]:
         (lambda: env.reset(np.array([0, 1, 2, -1])), ">= 0"),
         (lambda: env.reset(worlds=np.array([4])), "0..3"),
         (lambda: env.reset(worlds=np.array([1, 1])), "distinct"),
-        (lambda: env.reset(seed=-1), "seed >= 0"),
+        (lambda: env.reset(seed=-1), r"seed = -1 is refused: a whole number in 0\.\."),
         (lambda: env.load_rows(np.array([4]), rows[:1]), "0..3"),
         (lambda: env.load_rows(np.array([1, 1]), rows[:2]), "distinct"),
         (lambda: env.load_rows(np.array([0]), rows[:1, :-1]), str(rows.shape[1])),

@@ -8,8 +8,9 @@ with discount 0, the time limit with discount 1.
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import dm_env
 import numpy as np
@@ -19,13 +20,17 @@ from hipg_bench.adapters import death
 from hipg_bench.adapters.joint import split_action
 from hipg_bench.adapters.named import gather, numbered
 from hipg_bench.env import Step
+from hipg_bench.errors import ActionError
 from hipg_bench.registry import make, tasks
+from hipg_bench.rendering import gl
 from hipg_bench.spec import TaskSpec
 
 if TYPE_CHECKING:
     from dm_control.mujoco import Physics
 
     from hipg_bench.rendering.mirror import Mirror
+
+gl.choose_without_display()  # before dm_control is imported: it decides then
 
 ALL_TASKS = tuple(name.rpartition("-")[::2] for name in tasks())
 """All (domain name, task name), as in the suite; the task ``hazard_nav-4`` is ``("hazard_nav", "4")``."""
@@ -43,8 +48,8 @@ def load(
     Args:
         domain_name: a task's name up to its last hyphen.
         task_name: the rest of it.
-        task_kwargs: ``random``, a seed, a RandomState to draw it from, or None for another one each time; and
-            overrides, as for `hipg_bench.make`.
+        task_kwargs: ``random``, a seed, a RandomState or Generator to draw it from, or None for another one
+            each time; and overrides, as for `hipg_bench.make`.
         environment_kwargs: ``joint``, see `HipgEnvironment`.
         visualize_reward: without effect, as in the suite's tasks tagged ``no_reward_visualization``.
 
@@ -54,24 +59,35 @@ def load(
     """
     numbers = dict(task_kwargs or {})
     random = numbers.pop("random", None)
-    if random is None or isinstance(random, np.random.RandomState):
-        random = (random or np.random.RandomState()).randint(2**31)
+    if isinstance(random, np.random.RandomState):
+        random = int(random.randint(2**31))
+    elif isinstance(random, np.random.Generator):
+        random = int(random.integers(2**63))
     return HipgEnvironment(f"{domain_name}-{task_name}", random, **(environment_kwargs or {}), **numbers)
 
 
+class _Task(NamedTuple):
+    """What wrappers of ``dm_control.suite`` ask of a task."""
+
+    random: np.random.RandomState
+
+
 class HipgEnvironment(dm_env.Environment):
-    """One world of a task; ``spec`` holds its numbers.
+    """One world of a task; ``spec`` holds its numbers, ``task.random`` is for wrappers that add noise.
 
     With ``joint`` the team is one agent, as single-agent learners and `suite.wrappers.pixels` expect: arrays
     of the observation have a leading axis N, an action is (N * A,), the reward is the team's.
     """
 
-    def __init__(self, task: str | TaskSpec, seed: int = 0, *, joint: bool = False, **overrides: Any) -> None:
+    def __init__(
+        self, task: str | TaskSpec, seed: int | None = None, *, joint: bool = False, **overrides: Any
+    ) -> None:
         self._env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
         self.spec, self._joint = self._env.spec, joint
         self._alive, self._over = np.ones((1, self.spec.num_agents), bool), True
         self._number = numbered(self.spec)
         self._mirror: Mirror | None = None
+        self.task = _Task(np.random.RandomState(secrets.randbits(32) if seed is None else seed % 2**32))
 
     def reset(self) -> dm_env.TimeStep:
         """Start the next episode."""
@@ -92,7 +108,7 @@ class HipgEnvironment(dm_env.Environment):
             step = self._env.step(split_action(self._env, action, ()))
             reward, (terminated,), (truncated,) = float(step.reward[0]), step.terminated, step.truncated
         else:
-            told = {f"agent_{i}": part for i, part in enumerate(action)}
+            told = {f"agent_{i}": part for i, part in enumerate(self._listed(action))}
             step = self._env.step(gather(self._env, self._number, told, self._alive[0].tolist()))
             reward = death.pay(self.spec, step, self._alive)[0].tolist()
             (terminated,), (truncated,) = death.ends(self.spec, step)
@@ -110,7 +126,9 @@ class HipgEnvironment(dm_env.Environment):
         """Numbers in [-1, 1]."""
         size = self._env.action_size * (self.spec.num_agents if self._joint else 1)
         name = self._env.layout.action.blocks[0].name
-        return self._per_agent(specs.BoundedArray((size,), np.float64, -1.0, 1.0, name))
+        return self._per_agent(
+            specs.BoundedArray((size,), np.float64, np.full(size, -1.0), np.ones(size), name)
+        )
 
     def reward_spec(self) -> Any:
         """One number."""
@@ -132,6 +150,13 @@ class HipgEnvironment(dm_env.Environment):
     def close(self) -> None:
         """Refuse further use."""
         self._env.close()
+
+    def _listed(self, action: Any) -> Any:
+        if not hasattr(action, "__len__") or isinstance(action, str | bytes | Mapping):
+            raise ActionError(
+                f"{self.spec.task}: a list with an action for each agent is allowed, got {action!r:.80}"
+            )
+        return action
 
     def _per_agent(self, part: Any) -> Any:
         return part if self._joint else [part] * self.spec.num_agents

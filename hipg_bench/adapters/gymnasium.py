@@ -11,9 +11,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from jaxtyping import Float, UInt8
 
-from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action
+from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action, told_horizon
+from hipg_bench.arguments import MOST_SEED, whole
 from hipg_bench.env import Step
 from hipg_bench.errors import RenderError
 from hipg_bench.registry import make
@@ -27,14 +29,14 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as Gymnasium has it)
 
     def __init__(
-        self, task: str | TaskSpec, render_mode: str | None = None, seed: int = 0, **overrides: Any
+        self, task: str | TaskSpec, render_mode: str | None = None, seed: int | None = None, **overrides: Any
     ) -> None:
         """Build the world.
 
         Args:
             task: a name, or a spec of your own.
             render_mode: ``rgb_array`` or nothing.
-            seed: of the first episodes; a reset with a seed replaces it.
+            seed: of the first episodes, by default another each time; a reset with a seed replaces it.
             **overrides: as for `hipg_bench.make`.
 
         Raises:
@@ -42,6 +44,7 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         self._env = env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
         self.task_spec, self.render_mode = env.spec, render_mode
+        self._spec: EnvSpec | None = None
         self.metadata = {**self.metadata, "render_fps": round(1 / env.spec.control_step)}
         if render_mode not in (None, "rgb_array"):
             raise RenderError(
@@ -51,10 +54,22 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._live = Live(env.spec, render_mode) if render_mode else None
         self.observation_space, self.action_space = joint_spaces(env)
 
+    # Gymnasium's own is an attribute, which it sets after it has built the environment
+    @property
+    def spec(self) -> EnvSpec | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Gymnasium's, with the horizon."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, registered: EnvSpec | None) -> None:
+        self._spec = told_horizon(registered, self.task_spec)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, "NO"], dict[str, Any]]:
         """Start the next episode, with a seed episode 0 of that seed; ``options`` has no effect."""
+        if seed is not None:
+            seed = whole(seed, f"{self.task_spec.task}: seed", 0, MOST_SEED)
         super().reset(seed=seed)
         step = self._env.reset(seed=seed)
         if self._live:

@@ -9,11 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float
 
-from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action
+from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action, told_horizon
+from hipg_bench.arguments import MOST_SEED, whole
 from hipg_bench.env import Step
 from hipg_bench.errors import HipgError, SpecError, hint
 from hipg_bench.registry import make
@@ -34,7 +36,7 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         task: str | TaskSpec,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        seed: int = 0,
+        seed: int | None = None,
         threads: int = 0,
         **overrides: Any,
     ) -> None:
@@ -44,7 +46,7 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             task: a name, or a spec of your own.
             num_envs: B.
             autoreset_mode: when a world goes on with its next episode.
-            seed: of the first episodes; a reset with a seed replaces it.
+            seed: of the first episodes, by default another each time; a reset with a seed replaces it.
             threads: physics threads; 0 for all cores. Results do not depend on it.
             **overrides: as for `hipg_bench.make`.
 
@@ -54,13 +56,24 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._mode = _checked(autoreset_mode)
         at_once = self._mode is AutoresetMode.SAME_STEP
         self._env = env = make(task, num_envs, seed, threads=threads, autoreset=at_once, **overrides)
-        self.task_spec, self.num_envs = env.spec, num_envs
+        self.task_spec, self.num_envs = env.spec, env.num_envs
+        self._spec: EnvSpec | None = None
         self.metadata = {"render_modes": [], "autoreset_mode": self._mode}
         self.single_observation_space, self.single_action_space = joint_spaces(env)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._ended = np.empty(0, np.int64)
         self.closed = False
+
+    # Gymnasium's own is an attribute, which it sets after it has built the environment
+    @property
+    def spec(self) -> EnvSpec | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Gymnasium's, with the horizon."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, registered: EnvSpec | None) -> None:
+        self._spec = told_horizon(registered, self.task_spec)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -74,6 +87,8 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             HipgError: another mask.
         """
+        if seed is not None:
+            seed = whole(seed, f"{self.task_spec.task}: seed", 0, MOST_SEED)
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
         if not isinstance(mask, np.ndarray) or mask.shape != (self.num_envs,) or mask.dtype != bool:

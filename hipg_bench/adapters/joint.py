@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from jaxtyping import Float
 
+from hipg_bench.arguments import numbers
 from hipg_bench.env import BatchEnv, Step
-from hipg_bench.errors import ActionError
+from hipg_bench.spec import TaskSpec
 
 
 def joint_spaces(env: BatchEnv) -> tuple[Box, Box]:
     """Observation (N * O,) and action (N * A,), the agents' one after another."""
-    seen = Box(-np.inf, np.inf, (env.num_agents * env.observation_size,))
+    low, high = (np.tile(ends, env.num_agents) for ends in env.layout.observation.limits)
+    seen = Box(low, high)
     return seen, Box(-1.0, 1.0, (env.num_agents * env.action_size,))
 
 
@@ -29,14 +33,21 @@ def split_action(env: BatchEnv, action: Any, lead: tuple[int, ...]) -> Float[np.
     Raises:
         ActionError: not numbers of this shape.
     """
-    action, size = np.asarray(action), env.action_size
-    shape = (*lead, env.num_agents * size)
-    if action.shape != shape or action.dtype.kind not in "fiub":
-        raise ActionError(
-            f"{env.spec.task}: numbers of shape {shape} are allowed, {size} for each agent in turn, "
-            f"got {action.dtype} of shape {action.shape}"
-        )
-    return action.reshape(env.num_envs, env.num_agents, size)
+    size = env.action_size
+    shape, note = (*lead, env.num_agents * size), f", {size} for each agent in turn"
+    return numbers(action, env.spec.task, shape, note=note).reshape(env.num_envs, env.num_agents, size)
+
+
+def told_horizon(registered: EnvSpec | None, spec: TaskSpec) -> EnvSpec | None:
+    """Gymnasium's spec of an environment, which says how long episodes are: wrappers ask for it.
+
+    It is not registered so: Gymnasium would end episodes there, whatever ``horizon`` is asked for.
+    """
+    if registered is None or registered.max_episode_steps is not None:
+        return registered
+    told = copy.copy(registered)
+    told.max_episode_steps = spec.horizon
+    return told
 
 
 def joint_info(step: Step) -> dict[str, np.ndarray]:

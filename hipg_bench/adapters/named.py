@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
 
+from hipg_bench.arguments import numbers
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import ActionError, UnknownNameError, hint
 from hipg_bench.spec import TaskSpec
@@ -30,7 +31,7 @@ def checked_name(spec: TaskSpec, agent: Any, number: Mapping[str, int]) -> str:
 
 
 def gather(
-    env: BatchEnv, number: Mapping[str, int], actions: Mapping[str, Any], alive: Sequence[bool]
+    env: BatchEnv, number: Mapping[str, int], actions: Any, alive: Sequence[bool]
 ) -> Float[np.ndarray, "1 N A"]:
     """Stack the actions of one world's agents; what the dead are told is left out.
 
@@ -45,7 +46,12 @@ def gather(
         ActionError: a living agent without an action, or with one that is not A numbers.
     """
     task, shape = env.spec.task, (env.action_size,)
-    for agent in actions.keys() - number.keys():
+    if not isinstance(actions, Mapping):
+        raise ActionError(
+            f"{task}: a dict with an action for each live agent is allowed, got {actions!r:.80}"
+        )
+    actions = cast(Mapping[Any, Any], actions)
+    for agent in [name for name in actions if name not in number]:
         checked_name(env.spec, agent, number)
     out = np.zeros((1, env.num_agents, env.action_size))
     for agent, i in number.items():
@@ -53,11 +59,5 @@ def gather(
             continue
         if agent not in actions:
             raise ActionError(f"{task}: {agent} is alive and needs an action of shape {shape}, it has none")
-        action = np.asarray(actions[agent])
-        if action.shape != shape or action.dtype.kind not in "fiub":
-            raise ActionError(
-                f"{task}: numbers of shape {shape} are allowed for {agent}, "
-                f"got {action.dtype} of shape {action.shape}"
-            )
-        out[0, i] = action
+        out[0, i] = numbers(actions[agent], task, shape, whose=f" for {agent}")
     return out

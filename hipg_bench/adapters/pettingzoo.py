@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pettingzoo
 from gymnasium.spaces import Box
-from gymnasium.utils import EzPickle
 from jaxtyping import Float, UInt8
 
 from hipg_bench.adapters import death
@@ -27,8 +26,8 @@ Told = dict[str, Any]
 """By agent."""
 
 
-class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPickle):
-    """One world of a task; what pickle and deepcopy make of it starts anew.
+class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
+    """One world of a task; what pickle and deepcopy make of it goes on where it was.
 
     Infos hold ``alive`` and ``health``.
 
@@ -43,7 +42,7 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
         task: str | TaskSpec,
         dead: str = "remove",
         render_mode: str | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         **overrides: Any,
     ) -> None:
         """Build the world.
@@ -52,13 +51,12 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
             task: a name, or a spec of your own.
             dead: ``remove`` or ``ghost``, what becomes of the dead.
             render_mode: ``human`` for a window, ``rgb_array`` for pictures.
-            seed: of the first episodes; a reset with a seed replaces it.
+            seed: of the first episodes, by default another each time; a reset with a seed replaces it.
             **overrides: as for `hipg_bench.make`.
 
         Raises:
             UnknownNameError, SpecError, RenderError: an argument that is not allowed.
         """
-        EzPickle.__init__(self, task, dead, render_mode, seed, **overrides)
         self._env = env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
         self.task_spec = spec = env.spec
         if dead not in ("remove", "ghost"):
@@ -71,9 +69,9 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray], EzPic
         }  # fmt: skip
         self._number = numbered(spec)
         self.possible_agents, self.agents = list(self._number), []
-        self._sees = {agent: Box(-np.inf, np.inf, (env.observation_size,)) for agent in self._number}
+        self._sees = {agent: Box(*env.layout.observation.limits) for agent in self._number}
         self._does = {agent: Box(-1.0, 1.0, (env.action_size,)) for agent in self._number}
-        self.state_space = Box(-np.inf, np.inf, (env.state_size,))
+        self.state_space = Box(*env.layout.state.limits)
         self._now: Step | None = None
 
     def observation_space(self, agent: str) -> Box:

@@ -70,7 +70,7 @@ class HipgMultiAgentEnv(MultiAgentEnv):
         self._live = Live(env.spec, self.render_mode) if self.render_mode else None
         self._number = numbered(env.spec)
         self.possible_agents, self.agents = list(self._number), []
-        self.observation_spaces = {a: Box(-np.inf, np.inf, (env.observation_size,)) for a in self._number}
+        self.observation_spaces = {a: Box(*env.layout.observation.limits) for a in self._number}
         self.action_spaces = {a: Box(-1.0, 1.0, (env.action_size,)) for a in self._number}
         self._acts = np.zeros(env.num_agents, bool)
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 
 from hipg_bench.adapters import death
-from hipg_bench.errors import ActionError
+from hipg_bench.arguments import MOST_SEED, numbers, whole
 from hipg_bench.registry import make
 from hipg_bench.spec import TaskSpec
 
@@ -27,12 +27,17 @@ class HipgVecEnv(VecEnv):
     """B worlds of a task; ``task_spec`` holds its numbers. Infos tell who is ``alive``."""
 
     def __init__(
-        self, task: str | TaskSpec, num_envs: int = 1, seed: int = 0, threads: int = 0, **overrides: Any
+        self,
+        task: str | TaskSpec,
+        num_envs: int = 1,
+        seed: int | None = None,
+        threads: int = 0,
+        **overrides: Any,
     ) -> None:
-        """Build B = ``num_envs`` worlds, otherwise as `hipg_bench.make`."""
+        """Build B = ``num_envs`` worlds, as `hipg_bench.make`; without a seed they are others each time."""
         self._env = env = make(task, num_envs, seed, threads=threads, autoreset=False, **overrides)
         self.task_spec, self.render_mode = env.spec, None
-        sees, does = Box(-np.inf, np.inf, (env.observation_size,)), Box(-1.0, 1.0, (env.action_size,))
+        sees, does = Box(*env.layout.observation.limits), Box(-1.0, 1.0, (env.action_size,))
         super().__init__(num_envs * env.num_agents, sees, does)
         self._lived = np.ones((num_envs, env.num_agents), bool)
         self._action = np.empty(0)
@@ -43,6 +48,16 @@ class HipgVecEnv(VecEnv):
         self._reset_seeds()
         self._lived = step.info["alive"]
         return self._by_slot(step.observation)
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """From the next reset on, worlds are those of this seed.
+
+        Raises:
+            SpecError: not a whole number in 0..2^64 - 1.
+        """
+        if seed is not None:
+            seed = whole(seed, f"{self.task_spec.task}: seed", 0, MOST_SEED)
+        return list(super().seed(seed))
 
     def step_async(self, actions: Any) -> None:
         """Keep the actions (B * N, A) for `step_wait`."""
@@ -56,12 +71,8 @@ class HipgVecEnv(VecEnv):
             ActionError: not (B * N, A) numbers, or one for a live agent that is not finite.
         """
         env, shape = self._env, (self.num_envs, self._env.action_size)
-        if np.shape(self._action) != shape:
-            raise ActionError(
-                f"{self.task_spec.task}: actions of shape {shape} (B * N, A) are allowed, "
-                f"got {np.shape(self._action)}"
-            )
-        step = env.step(self._action.reshape(env.num_envs, env.num_agents, env.action_size))
+        action = numbers(self._action, self.task_spec.task, shape, note=" (B * N, A)")
+        step = env.step(action.reshape(env.num_envs, env.num_agents, env.action_size))
         terminated, truncated = death.ends(self.task_spec, step)
         done = terminated | truncated
         reward = death.pay(self.task_spec, step, self._lived).astype(np.float32)

@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase
 
 from hipg_bench.adapters import death
 from hipg_bench.adapters.named import numbered
+from hipg_bench.arguments import MOST_SEED, whole
 from hipg_bench.env import Step
 from hipg_bench.errors import HipgError
 from hipg_bench.registry import make
@@ -41,13 +42,16 @@ class HipgEnv(EnvBase):
         self,
         task: str | TaskSpec,
         num_envs: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         *,
         device: torch.device | str = "cpu",
         threads: int = 0,
         **overrides: Any,
     ) -> None:
-        """Build the worlds: device is where tensors are put, the rest is as for `hipg_bench.make`."""
+        """Build the worlds: device is where tensors are put, the rest is as for `hipg_bench.make`.
+
+        Without a seed the first episodes are others each time; `set_seed` replaces it.
+        """
         super().__init__(device=torch.device(device), batch_size=torch.Size((num_envs,)))
         env = self._env = make(task, num_envs, seed, threads=threads, autoreset=False, **overrides)
         self.spec = env.spec
@@ -58,13 +62,17 @@ class HipgEnv(EnvBase):
         size, team = torch.Size, torch.Size((env.num_agents,))
         flag = Categorical(2, size((1,)), dtype=torch.bool)
         sees = Composite(
-            observation=Unbounded(size((*team, env.observation_size))),
+            observation=Unbounded(size((*team, env.observation_size)), dtype=torch.float32),
             alive=Categorical(2, size((*team, 1)), dtype=torch.bool),
             shape=team,
         )
-        does = Composite(action=Bounded(-1.0, 1.0, size((*team, env.action_size))), shape=team)
-        paid = Composite(reward=Unbounded(size((*team, 1))), shape=team)
-        self.observation_spec = self._all(agents=sees, state=Unbounded(size((env.state_size,))))
+        does = Composite(
+            action=Bounded(-1.0, 1.0, size((*team, env.action_size)), dtype=torch.float32), shape=team
+        )
+        paid = Composite(reward=Unbounded(size((*team, 1)), dtype=torch.float32), shape=team)
+        self.observation_spec = self._all(
+            agents=sees, state=Unbounded(size((env.state_size,)), dtype=torch.float32)
+        )
         self.action_spec, self.reward_spec = self._all(agents=does), self._all(agents=paid)
         self.done_spec = self._all(done=flag, terminated=flag.clone(), truncated=flag.clone())
 
@@ -115,6 +123,16 @@ class HipgEnv(EnvBase):
             "truncated": ends[1],
         }
         return TensorDict(shown, self.batch_size, self.device)
+
+    def set_seed(self, seed: Any = None, static_seed: bool = False) -> int | None:
+        """See TorchRL's.
+
+        Raises:
+            SpecError: not a whole number in 0..2^64 - 1.
+        """
+        if seed is not None:
+            seed = whole(seed, f"{self.spec.task}: seed", 0, MOST_SEED)
+        return super().set_seed(seed, static_seed)
 
     def _set_seed(self, seed: int | None) -> None:
         """From the next reset on, worlds are those of this seed."""

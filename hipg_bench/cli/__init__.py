@@ -6,9 +6,16 @@ Modules of this package import nothing heavy at their top, so that ``--help`` an
 
 from __future__ import annotations
 
+import errno
+import io
+import os
+import signal
 import sys
+from types import FrameType
+from typing import Any, NoReturn
 
 import typer
+import typer.core
 
 from hipg_bench.cli import (
     agents,
@@ -17,6 +24,7 @@ from hipg_bench.cli import (
     calibrate,
     collect,
     compare,
+    console,
     doctor,
     evaluate,
     export,
@@ -30,7 +38,29 @@ from hipg_bench.cli import (
 )
 from hipg_bench.errors import HipgError
 
+
+class _Commands(typer.core.TyperGroup):
+    """The commands; what the machine refuses them becomes an error that names the file."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command.
+
+        Raises:
+            HipgError: a mistake of the user's, or of a file's or the machine's.
+        """
+        try:
+            return super().invoke(ctx)
+        except OSError as error:
+            if error.errno == errno.EPIPE:
+                raise
+            place = f"{error.filename}: " if error.filename is not None else ""
+            raise HipgError(f"{place}{error.strerror or error}") from error
+        except MemoryError as error:
+            raise HipgError("there is not enough memory") from error
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Teams that lose members: 3D tasks, trained teams, scores and films.",
     no_args_is_help=True,
     add_completion=False,
@@ -56,9 +86,43 @@ app.command()(doctor.doctor)
 
 
 def main() -> None:
-    """Run the command line; mistakes of the user's are told in one line, with exit code 2."""
+    """Run the command line; mistakes are told in one line, with exit code 2, and interruptions with 130."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that knows no UTF-8
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL:
+            signal.signal(getattr(signal, name), _interrupt)
+    _check_environment()
     try:
         app()
     except HipgError as error:
-        sys.stderr.write(f"hipg-bench: {error}\n")
-        sys.exit(2)
+        _end(str(error))
+    except SystemExit as ended:
+        if ended.code == _INTERRUPTED:
+            console.warn("hipg-bench: interrupted")
+        raise
+
+
+_INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """End as after Ctrl-C: children end, and temporary files go."""
+    signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def _check_environment() -> None:
+    """Refuse what keeps MuJoCo from being imported; ``doctor`` tells of it itself."""
+    from hipg_bench.rendering import gl
+
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if chosen.lower() not in gl.NAMES and sys.argv[1:2] != ["doctor"]:
+        _end(f"MUJOCO_GL = {chosen!r} is refused: {', '.join(gl.BACKENDS)} or glfw is allowed, or unset it")
+
+
+def _end(message: str) -> NoReturn:
+    console.warn(f"hipg-bench: {message}")
+    sys.exit(2)

@@ -43,11 +43,11 @@ def show(
     if as_json:
         console.show_json(facts)
         return
-    console.say(f"[bold]{facts['name']}[/bold]: {facts['summary']}")
-    console.out.print(facts["folder"], markup=False, soft_wrap=True)
+    console.say(f"{facts['name']}: {facts['summary']}")
+    console.say(facts["folder"])
     for name in ("kind", "builtin", "entry_point", "execution", "authors", "license", "link"):
         if facts[name]:
-            console.out.print(f"{name}: {facts[name]}", markup=False)
+            console.say(f"{name}: {facts[name]}")
     if not facts["tasks"]:
         console.say("it has no policies yet")
         return

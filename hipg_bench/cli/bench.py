@@ -153,7 +153,7 @@ def bench(
         console.show_json(document)
     else:
         busy = f"load {host['load']} before" if host["load"] > host["cores"] / 4 else "idle before"
-        console.say(f"\n[dim]{host['processor']}, {host['cores']} cores, {busy}[/dim]")
+        console.say(f"\n{host['processor']}, {host['cores']} cores, {busy}")
     if plot is not None:
         from hipg_bench.evaluation.bench.plot import draw
 
@@ -191,7 +191,7 @@ def _show(section: str, rows: list[Any]) -> None:
     for row in rows:
         values = dataclasses.asdict(row)
         if left_out := values.get("left_out"):
-            console.err.print(f"{values['face']}: left out, {left_out}", markup=False)
+            console.warn(f"{values['face']}: left out, {left_out}")
             continue
         shown.add_row(*(template.format(**values) for template in columns.values()))
     console.show(shown)

@@ -61,7 +61,7 @@ def _calibrate_split(
     if as_json:
         console.show_json({"task": spec.task, "split": split, "anchors": anchors.model_dump(mode="json")})
         return
-    console.say(f"[bold]{spec.task}[/bold] in {split}\n")
+    console.say(f"{spec.task} in {split}\n")
     rows = console.table("what", ">value", "95 %", "")
     for name, anchor in (("random", anchors.random), ("reference", anchors.reference)):
         note = f"{anchor.episodes} episodes" if anchor.episodes else anchors.reference_is
@@ -87,7 +87,7 @@ def _print(measured: Calibration) -> None:
     if anchors is None:
         return
     standard = "standard" in spec.tags  # what is wanted of a task; the paper's are as they are
-    console.say(f"[bold]{spec.task}[/bold] v{spec.version} ({spec.fingerprint})\n")
+    console.say(f"{spec.task} v{spec.version} ({spec.fingerprint})\n")
     rows = console.table("what", ">value", "95 %", "wanted", "")
     for name, anchor in (("random", anchors.random), ("reference", anchors.reference)):
         note = f"{anchor.episodes} episodes" if anchor.episodes else anchors.reference_is
@@ -115,4 +115,4 @@ def _print(measured: Calibration) -> None:
 
 
 def _wanted(met: bool, rule: str) -> str:
-    return f"[green]{rule}[/green]" if met else f"[red]{rule} MISSED[/red]"
+    return rule if met else f"{rule} MISSED"

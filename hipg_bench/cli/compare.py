@@ -24,7 +24,7 @@ def compare(
     console.show(table)
     for other in folders[1:]:
         chance, ends = ranking.better(names[f"{folders[0]}"], names[f"{other}"])
-        console.say(f"\n[bold]{folders[0]}[/bold] against {other}")
+        console.say(f"\n{folders[0]} against {other}")
         console.say(f"P(improvement) {chance:.2f} {console.interval(ends)}")
         rows = console.table("task", ">difference of scores", "")
         for task, (difference, interval) in comparing.differences(folders[0], other).items():

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+import unicodedata
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 out = Console(highlight=False)
 """Results."""
@@ -19,7 +21,7 @@ err = Console(stderr=True, highlight=False)
 def progress() -> Progress:
     """A progress display with the time left; silent when nobody watches."""
     return Progress(
-        TextColumn("{task.description:<18}"),
+        TextColumn("{task.description:<18}", markup=False),
         BarColumn(bar_width=None),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
@@ -33,13 +35,37 @@ def progress() -> Progress:
 
 def table(*columns: str, title: str | None = None) -> Table:
     """A plain table; ``>`` before a column's name aligns it to the right, and only the last one wraps."""
-    made = Table(
+    made = _Table(
         title=title, title_justify="left", box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0)
     )
     for k, column in enumerate(columns, start=1):
         right = column.startswith(">")
         made.add_column(column.lstrip(">"), justify="right" if right else "left", no_wrap=k < len(columns))
     return made
+
+
+class _Table(Table):
+    """A table whose cells are plain text: names and reasons come from strangers."""
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """Add a row; see rich's own."""
+        plain = (Text(printable(cell)) if isinstance(cell, str) else cell for cell in cells)
+        super().add_row(*plain, **options)
+
+
+def printable(text: str) -> str:
+    """The text without what steers a terminal or cannot be encoded: control characters, surrogates.
+
+    Line ends and tabs stay.
+    """
+    return "".join(
+        character if character in "\n\t" or unicodedata.category(character) not in _UNPRINTABLE else "\ufffd"
+        for character in text
+    )
+
+
+_UNPRINTABLE = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
+"""Categories of Unicode."""
 
 
 def show(rows: Table) -> None:
@@ -50,8 +76,13 @@ def show(rows: Table) -> None:
 
 
 def say(text: str) -> None:
-    """Print a line with rich's markup; a pipe gets it unbroken."""
-    out.print(text, soft_wrap=not sys.stdout.isatty())
+    """Print a line of the results, unbroken."""
+    out.print(Text(printable(text)), soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """Print a line on the error stream, unbroken."""
+    err.print(Text(printable(text)), soft_wrap=True)
 
 
 def show_json(value: Any) -> None:
@@ -65,5 +96,5 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def interval(ends: list[float] | tuple[float, float] | None, digits: int = 2) -> str:
-    """A 95 % interval in brackets (escaped: rich reads brackets as style)."""
-    return "" if ends is None else rf"\[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+    """A 95 % interval in brackets."""
+    return "" if ends is None else f"[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"

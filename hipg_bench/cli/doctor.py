@@ -15,7 +15,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
 ) -> None:
     """Try what this suite needs; say how to mend what does not work. Exit code 1 if scoring cannot work."""
-    from rich.markup import escape
+    from rich.text import Text
 
     from hipg_bench.evaluation import doctor as clinic
 
@@ -28,7 +28,7 @@ def doctor(
         rows = console.table("", "what", "found")
         for finding in findings:
             style = _STYLE[finding.level]
-            rows.add_row(f"[{style}]{finding.level}[/]", finding.name, escape(finding.text))
+            rows.add_row(Text(finding.level, style), finding.name, finding.text)
         console.show(rows)
         mends = {
             finding.mend: finding.name for finding in findings if finding.mend and finding.level != "note"
@@ -36,7 +36,7 @@ def doctor(
         if mends:
             console.say("\nTo mend it, run:")
             for mend, name in mends.items():
-                console.say(f"  {escape(mend)}    [dim]# {name}[/]")
+                console.say(f"  {mend}    # {name}")
         else:
             console.say("\nNothing is wrong.")
     if not clinic.healthy(findings):

@@ -47,14 +47,17 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
 ) -> None:
     """Score an agent on tasks, with films and a report."""
-    from hipg_bench.evaluation import splits
+    from hipg_bench.evaluation import runner, splits
     from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.paths import new_folder
     from hipg_bench.policies.bundle import load_agent
 
     who, suite = load_agent(agent), suite_of(tasks)
     plan = Plan(seed, _QUICK if quick else episodes, num_envs, threads)
     films = (0 if quick else 1) if video is None else video
-    folder = out or Path("runs") / f"{who.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for name in splits.SPLITS if split == "all" else (split,):
+        runner.playable(who, suite, name)
+    folder = out or new_folder(Path("runs"), f"{who.name}-{time.strftime('%Y%m%d-%H%M%S')}")
     parts = {name: folder / name for name in splits.SPLITS} if split == "all" else {split: folder}
     every: dict[str, Any] = {}
     for name, part in parts.items():
@@ -106,9 +109,9 @@ def _print(results: dict[str, Any], folder: Path) -> None:
             ", ".join(f"{reason} {count}" for reason, count in task["end_reasons"].items()),
         )  # fmt: skip
     for task in results["skipped"]:
-        rows.add_row(task["task"], "-", "", "-", "-", "-", f"[dim]{task['reason']}[/dim]")
+        rows.add_row(task["task"], "-", "", "-", "-", "-", task["reason"])
     what = f"{results['suite']}, {results['split']}"
-    console.say(f"[bold]{results['agent']}[/bold] on {what}: {results['agent_summary']}\n")
+    console.say(f"{results['agent']} on {what}: {results['agent_summary']}\n")
     console.show(rows)
     whole = results["aggregate"]
     if whole["score_iqm"] is not None:
@@ -119,10 +122,10 @@ def _print(results: dict[str, Any], folder: Path) -> None:
         )
         console.say(
             f"\nscore, interquartile mean over {whole['tasks']} tasks{zero}: "
-            f"[bold]{number(whole['score_iqm'])}[/bold] {interval(whole['score_iqm_ci95'])}"
+            f"{number(whole['score_iqm'])} {interval(whole['score_iqm_ci95'])}"
         )
     if results["episodes_per_policy"] < 320:
-        console.say(f"[dim]{results['episodes_per_policy']} episodes per policy: not for comparison[/dim]")
+        console.say(f"{results['episodes_per_policy']} episodes per policy: not for comparison")
     for trouble in results["film_trouble"]:
-        console.err.print(f"no film: {trouble}", markup=False)
-    console.out.print(f"\n{folder / 'report.html'}", markup=False, soft_wrap=True)
+        console.warn(f"no film: {trouble}")
+    console.say(f"\n{folder / 'report.html'}")

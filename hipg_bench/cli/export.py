@@ -21,4 +21,4 @@ def export(
     from hipg_bench.paths import write_text
 
     write_text(out, json.dumps(marl_eval(folders), allow_nan=False) + "\n")
-    console.out.print(str(out), markup=False, soft_wrap=True)
+    console.say(str(out))

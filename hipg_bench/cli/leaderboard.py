@@ -57,16 +57,16 @@ def add(
     from hipg_bench.leaderboard.board import Board
     from hipg_bench.leaderboard.source import opened
 
-    match = _match(splits, tasks, episodes, threads)
-    with opened(what, trust=trust) as source, _telling() as progress:
+    match, store = _match(splits, tasks, episodes, threads), Board(board)
+    with store.workspace("add") as place, opened(what, place, trust=trust) as source, _telling() as progress:
         added = adding.add(
-            Board(board), source, match, claims=claims, replace=replace,
+            store, source, match, claims=claims, replace=replace,
             film_tasks=_filmed(films, match), progress=progress,
         )  # fmt: skip
     _tell_trouble(added.trouble)
     entry = added.entry
     console.say(
-        f"[bold]{entry.name}[/bold] is on the board, {entry.status(None)}: "
+        f"{entry.name} is on the board, {entry.status(None)}: "
         f"{sum(len(seeds) for seeds in entry.policies.values())} policies for {len(entry.policies)} tasks"
     )
 
@@ -82,12 +82,13 @@ def verify(
     """Play an entry again: are its rows true, and how does it do on hidden worlds?"""
     from hipg_bench.leaderboard import verify as verifying
     from hipg_bench.leaderboard.board import Board
-    from hipg_bench.leaderboard.salt import read_salt
+    from hipg_bench.leaderboard.salt import private_folder, read_salt
 
     with _telling() as progress:
         found = verifying.verify(
-            Board(board), name, read_salt(board, salt_file), trust=trust, threads=threads, progress=progress
-        )
+            Board(board), name, read_salt(board, salt_file), private_folder(salt_file),
+            trust=trust, threads=threads, progress=progress,
+        )  # fmt: skip
     _report(name, found)
     if found.outcome != "verified":
         raise typer.Exit(1)
@@ -102,9 +103,11 @@ def build(
     from hipg_bench.leaderboard import site
     from hipg_bench.leaderboard.board import Board
 
-    count = site.build(Board(board), out)
-    console.say(f"{count} entries")
-    console.out.print(f"{out / 'index.html'}", markup=False, soft_wrap=True)
+    view = site.build(Board(board), out)
+    console.say(f"{len(view.entries)} entries")
+    for reason in view.left_out.values():
+        console.warn(f"left out: {reason}")
+    console.say(f"{out / 'index.html'}")
 
 
 @app.command()
@@ -140,7 +143,7 @@ def refresh(
     from hipg_bench.leaderboard import adding
     from hipg_bench.leaderboard import verify as verifying
     from hipg_bench.leaderboard.board import Board
-    from hipg_bench.leaderboard.salt import read_salt
+    from hipg_bench.leaderboard.salt import private_folder, read_salt
     from hipg_bench.leaderboard.source import opened
     from hipg_bench.policies.bundle import agents
 
@@ -158,15 +161,17 @@ def refresh(
                     progress=progress,
                 )
             found = (
-                verifying.verify(Board(board), name, salt, threads=threads, progress=progress)
-                if salt
+                verifying.verify(
+                    Board(board), name, salt, private_folder(salt_file), threads=threads, progress=progress
+                )
+                if salt and salt_file
                 else None
             )
         _tell_trouble(added.trouble)
         if found:
             _report(name, found)
         else:
-            console.say(f"[bold]{name}[/bold]: self-reported")
+            console.say(f"{name}: self-reported")
 
 
 @salts.command()
@@ -189,10 +194,15 @@ def reveal(
     board: BoardFolder = BOARD,
 ) -> None:
     """Publish the salt: everybody can play the hidden worlds again, and a new one can be drawn."""
-    from hipg_bench.leaderboard.salt import reveal_salt
+    from hipg_bench.leaderboard.board import Board
+    from hipg_bench.leaderboard.salt import private_folder, reveal_salt
 
     kept = reveal_salt(board, file)
     console.say(f"{board / 'commitment.json'} now holds the salt behind {kept.sha256}")
+    copied, wrong = Board(board).publish_rows(private_folder(file))
+    console.say(f"{copied} files of rows on hidden worlds are published with their entries")
+    for path in wrong:
+        console.warn(f"missing or not as promised: {path}")
 
 
 def _match(splits: str, tasks: str, episodes: int, threads: int) -> Match:
@@ -236,12 +246,12 @@ def _telling() -> Generator[Callable[[str, float, float], None]]:
 
 def _tell_trouble(trouble: Sequence[str]) -> None:
     for line in trouble:
-        console.err.print(f"no film: {line}", markup=False)
+        console.warn(f"no film: {line}")
 
 
 def _report(name: str, found: Verification) -> None:
     """What a verification found."""
-    console.say(f"[bold]{name}[/bold]: {found.outcome}, {found.execution}, sandbox {found.sandbox}")
+    console.say(f"{name}: {found.outcome}, {found.execution}, sandbox {found.sandbox}")
     console.say(f"{found.compared} rows compared, {found.differing} differ")
     for reason in found.reasons:
-        console.out.print(reason, markup=False, soft_wrap=True)
+        console.say(reason)

@@ -38,11 +38,9 @@ def init(
     from hipg_bench.submissions.init import init as make
 
     for path in make(name, tier, authors=authors, license=license, summary=summary):
-        console.out.print(str(path), markup=False, soft_wrap=True)
+        console.say(str(path))
     weights = f"{name}/<task>/seed<k>" + (".safetensors", ".onnx", ".npz")[tier]
-    console.out.print(
-        f"next: write {weights}, then: hipg-bench submit check {name}", markup=False, soft_wrap=True
-    )
+    console.say(f"next: write {weights}, then: hipg-bench submit check {name}")
 
 
 @app.command()
@@ -67,7 +65,7 @@ def check(
             console.say(f"\n{errors} error{'s' * (errors > 1)}: it cannot be packed yet")
         raise typer.Exit(1)
     if not as_json:
-        console.out.print(f"\nready: hipg-bench submit pack {folder}", markup=False, soft_wrap=True)
+        console.say(f"\nready: hipg-bench submit pack {folder}")
 
 
 @app.command()
@@ -90,17 +88,18 @@ def pack(
         raise typer.Exit(1)
     target = out or Path(f"{folder.resolve().name}.zip")
     digest = write(folder, target)
-    console.out.print(
-        f"{target}: {target.stat().st_size} bytes, sha256 {digest}", markup=False, soft_wrap=True
-    )
+    console.say(f"{target}: {target.stat().st_size} bytes, sha256 {digest}")
 
 
 def _print(finding: Finding) -> None:
     from rich.text import Text
 
     line = Text.assemble(
-        (f"{finding.severity:<7}", _STYLES[finding.severity]), (finding.where, "bold"), ": ", finding.what
+        (f"{finding.severity:<7}", _STYLES[finding.severity]),
+        (console.printable(finding.where), "bold"),
+        ": ",
+        console.printable(finding.what),
     )
     console.out.print(line, soft_wrap=True)
     if finding.remedy:
-        console.out.print(Text(f"        {finding.remedy}", "dim"), soft_wrap=True)
+        console.say(f"        {finding.remedy}")

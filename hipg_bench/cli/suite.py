@@ -20,9 +20,9 @@ def check(as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] 
     if as_json:
         console.show_json(protocol.identity() | {"differences": differences})
     elif differences:
-        console.say(f"[red]the tree is not {protocol.SUITE}[/red]:")
+        console.say(f"the tree is not {protocol.SUITE}:")
         for line in differences:
-            console.out.print(f"  {line}", markup=False)
+            console.say(f"  {line}")
         console.say("\nif no behaviour changed (tests/test_golden.py passes): hipg-bench suite freeze")
     else:
         console.say(f"the tree is {protocol.SUITE} ({protocol.identity()['digest']})")
@@ -35,4 +35,4 @@ def freeze() -> None:
     """Write the suite file anew, after a change that leaves every episode as it was."""
     from hipg_bench.evaluation import protocol
 
-    console.out.print(str(protocol.freeze()), markup=False, soft_wrap=True)
+    console.say(str(protocol.freeze()))

@@ -51,7 +51,7 @@ def show(task: Annotated[str, typer.Argument(help="The task's name.")], as_json:
         blocks = {name: _blocks(vector) for name, vector in vectors.items()}
         console.show_json(spec.model_dump(mode="json") | {"fingerprint": spec.fingerprint, "vectors": blocks})
         return
-    console.say(f"[bold]{spec.task}[/bold] v{spec.version} ({spec.fingerprint}): {spec.summary}\n")
+    console.say(f"{spec.task} v{spec.version} ({spec.fingerprint}): {spec.summary}\n")
     _print_numbers(spec)
     titles = {
         "observation": "observation of one agent", "action": "action of one agent",
@@ -60,7 +60,7 @@ def show(task: Annotated[str, typer.Argument(help="The task's name.")], as_json:
     for name, vector in vectors.items():
         rows = console.table(
             "field", ">columns", ">size", "shape", "unit", "frame", "visible",
-            title=f"\n[bold]{titles[name]}[/bold]: {vector.size} numbers",
+            title=f"\n{titles[name]}: {vector.size} numbers",
         )  # fmt: skip
         for block in _blocks(vector):
             first, last = block["columns"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -46,11 +45,13 @@ def train(
     """Train a team, or the many of a sweep; what was killed goes on with the same command."""
     if (task is None) == (sweep is None) or (status and sweep is None):
         raise SpecError("train takes either --task or --sweep; --status belongs to the latter")
+    from hipg_bench.processes import usable_cores
+
     if sweep is not None and status:
-        _tell(sweep, out, workers or os.cpu_count() or 1)
+        _tell(sweep, out, workers or usable_cores())
         return
     if sweep is not None:
-        _train_many(sweep, out, workers or os.cpu_count() or 1)
+        _train_many(sweep, out, workers or usable_cores())
         return
 
     import torch
@@ -79,7 +80,7 @@ def _train_one(settings: AnySettings, out: Path, command: str) -> None:
     from hipg_bench.learning.run import train as run
 
     console.say(
-        f"[bold]{settings.task}[/bold], arm {settings.arm}, seed {settings.seed}: "
+        f"{settings.task}, arm {settings.arm}, seed {settings.seed}: "
         f"{settings.steps:,} environment steps into {out}"
     )
     with console.progress() as bars:
@@ -97,9 +98,7 @@ def _train_many(sweep: Path, out: Path, workers: int) -> None:
 
     runs = load(sweep, out)
     left = sum(not run.finished for run in runs)
-    console.say(
-        f"[bold]{sweep.name}[/bold]: {left} of {len(runs)} runs to do, {workers} at a time, into {out}"
-    )
+    console.say(f"{sweep.name}: {left} of {len(runs)} runs to do, {workers} at a time, into {out}")
     with console.progress() as bars:
         bar = bars.add_task("training", total=sum(run.settings.steps for run in runs))
 

@@ -1,15 +1,18 @@
 """Whether agents act on their own observations alone: found by replay, not believed.
 
 Declared networks and ONNX graphs are run per agent, so they cannot do otherwise. Code of others is given
-the whole team at once. Here worlds are played and recorded; then each agent's stream of observations is
-replayed in a fresh process where all other agents are dead and unseen and there is no other world. An
-agent that needs nobody else answers the same.
+the whole team at once. Here a batch is played as it is for the score and recorded. Then it is replayed in a
+fresh process: in every world one agent observes what it did before, and its team-mates observe what they
+did in other worlds. An agent that needs nobody else answers the same. The number of worlds, the seeds and
+who is alive look like those of any batch, so that code which behaves only while it is looked at has little
+to go by; what remains is that team-mates' observations do not fit together.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import secrets
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,13 +30,13 @@ TOLERANCE = 2.0**-16
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """An action that was another one when the agent was alone.
+    """An action that was another one when team-mates observed something else.
 
     Attributes:
         episode_id: in which episode of the evaluation seed.
         agent: whose.
         step: when, the first time.
-        size: largest difference of a coordinate; infinite if it failed alone.
+        size: largest difference of a coordinate; infinite if it failed.
     """
 
     episode_id: int
@@ -56,17 +59,19 @@ class Verdict:
 
     @property
     def decentralised(self) -> bool:
-        """Whether every agent acted as it does alone."""
-        return not self.differences
+        """Whether every agent acted on what it observed itself."""
+        return self.compared > 0 and not self.differences
 
     def __str__(self) -> str:
         if self.decentralised:
-            return f"decentralised: {self.compared} actions were the same alone"
+            return f"decentralised: {self.compared} actions did not depend on what team-mates observed"
+        if not self.differences:
+            return "not known to be decentralised: its batch failed, and nothing could be compared"
         worst = max(self.differences, key=lambda difference: difference.size)
         return (
-            f"centralised: {len(self.differences)} agents acted on more than they observed; alone, "
-            f"agent {worst.agent} of episode {worst.episode_id} differs by {worst.size:.3g} "
-            f"from step {worst.step} on"
+            f"centralised: {len(self.differences)} agents acted on more than they observed; agent "
+            f"{worst.agent} of episode {worst.episode_id} differs by {worst.size:.3g} from step {worst.step} "
+            f"on where its team-mates observe something else"
         )
 
 
@@ -109,48 +114,71 @@ class _Recorder:
         close(self._policy)
 
 
-def verify(spec: TaskSpec, policy: Policy, plan: Plan, worlds: Sequence[int] = (0, 1)) -> Verdict:
-    """Play some worlds together, then every agent of them alone, and compare.
+_REPLAYS = 4
+"""Times that a batch is replayed, each time with another agent of every world."""
 
-    Two worlds show an agent that carries something from one world to another. What an agent does rarely
-    may not occur in them: a verdict of ``decentralised`` is no proof.
+
+def verify(spec: TaskSpec, policy: Policy, plan: Plan, worlds: Sequence[int]) -> Verdict:
+    """Play a batch of worlds, then replay it with other team-mates' observations, and compare.
+
+    What an agent does rarely may not occur: a verdict of ``decentralised`` is no proof.
 
     Args:
         spec: the task.
         policy: acts on observations; all agents at once.
         plan: how worlds are made.
-        worlds: which, of one evaluation seed.
+        worlds: which, two or more of one evaluation seed; as many as in a scored batch.
     """
     recorder = _Recorder(policy)
     plan.play(spec, recorder, list(worlds))
+    chance = np.random.default_rng(secrets.randbits(64))
     compared = 0
-    differences: list[Difference] = []
+    found: dict[tuple[int, int], Difference] = {}
     for record in recorder.records:
-        for b in range(len(record.episode_id)):
-            for agent in range(record.num_agents):
-                sizes = list(_replay(policy, record, b, agent))
-                compared += len(sizes)
-                bad = np.flatnonzero(np.array(sizes) > TOLERANCE)
+        if len(record.episode_id) < 2:
+            continue  # played world by world, since the batch failed
+        first = chance.integers(record.num_agents, size=len(record.episode_id))
+        for turn in range(min(_REPLAYS, record.num_agents)):
+            target = (first + turn) % record.num_agents
+            sizes = _replay(policy, record, target, chance)
+            compared += int(np.isfinite(sizes).sum())
+            for b, agent in enumerate(target.tolist()):
+                bad = np.flatnonzero(np.nan_to_num(sizes[:, b]) > TOLERANCE)
                 if len(bad):
                     episode = int(record.episode_id[b])
-                    differences.append(Difference(episode, agent, int(bad[0]), max(sizes)))
-    return Verdict(compared, tuple(differences))
+                    worst = float(np.nanmax(sizes[:, b]))
+                    found[episode, agent] = Difference(episode, agent, int(bad[0]), worst)
+    return Verdict(compared, tuple(found.values()))
 
 
-def _replay(policy: Policy, record: _Record, b: int, agent: int) -> Iterator[float]:
-    """How much the agent's actions differ when it is alone, step by step, while it lives."""
+def _replay(
+    policy: Policy, record: _Record, target: Int[np.ndarray, "B"], chance: np.random.Generator
+) -> Float[np.ndarray, "T B"]:
+    """How much each world's target acts otherwise, step by step; NaN from its death on.
+
+    If the policy fails, the differences are infinite from then on.
+    """
+    steps, worlds = len(record.seen), len(target)
+    sizes = np.full((steps, worlds), np.nan)
+    here = np.arange(worlds)
+    # every team-mate's stream is that of the same agent in another world
+    source = (here[:, None] + chance.integers(1, worlds, size=(worlds, record.num_agents))) % worlds
+    source[here, target] = here
+    agents = np.arange(record.num_agents)
+    living = np.ones(worlds, bool)
+    t = 0
     try:
-        memory = policy.initial_state(record.seed, record.episode_id[b : b + 1], record.num_agents)
-        for seen, alive, action in zip(record.seen, record.alive, record.action, strict=True):
-            if not alive[b, agent]:
-                return
-            own = np.zeros_like(seen[:1])
-            own[0, agent] = seen[b, agent]
-            only = np.zeros((1, record.num_agents), bool)
-            only[0, agent] = True
-            answer, memory = policy.act(own, memory, only)
-            yield float(np.abs(answer[0, agent] - action[b, agent]).max())
+        memory = policy.initial_state(record.seed, record.episode_id, record.num_agents)
+        for t in range(steps):
+            seen, alive = record.seen[t][source, agents], record.alive[t][source, agents]
+            living &= alive[here, target]
+            if not living.any():
+                break
+            answer, memory = policy.act(seen, memory, alive)
+            apart = np.abs(answer[here, target] - record.action[t][here, target]).max(axis=-1)
+            sizes[t, living] = apart[living]
     except AgentFailure:
-        yield np.inf
+        sizes[t:, living] = np.inf
     finally:
         close(policy)
+    return sizes

@@ -16,6 +16,8 @@ from typing import Any, Literal, NamedTuple
 from packaging.requirements import Requirement
 from packaging.version import Version
 
+from hipg_bench import processes
+from hipg_bench.evaluation import machines
 from hipg_bench.rendering import gl
 from hipg_bench.sandbox import choice
 
@@ -59,6 +61,7 @@ def examine(told: Callable[[Finding], None] = lambda finding: None) -> list[Find
         _graphics,
         _encoder,
         _display,
+        _rows,
         _cores,
         _disk,
         _data,
@@ -85,6 +88,14 @@ def _python() -> Iterator[Finding]:
     version = platform.python_version()
     text = f"{version} at {sys.executable}, {platform.platform()}"
     yield Finding("python", "ok", text)
+
+
+def _rows() -> Iterator[Finding]:
+    differs = machines.why_rows_may_differ()
+    if differs:
+        yield Finding("rows", "note", f"{differs}; scores are the same within their intervals")
+    else:
+        yield Finding("rows", "ok", f"equal to those of other machines ({machines.PROMISE})")
 
 
 def _packages() -> Iterator[Finding]:
@@ -124,21 +135,7 @@ def _gl_variables() -> Iterator[Finding]:
         os.environ.get("MUJOCO_GL", "").lower(),
         os.environ.get("PYOPENGL_PLATFORM", "").lower(),
     )
-    if chosen not in (
-        *_GL_NAMES,
-        "wgl",
-        "cgl",
-        "disable",
-        "disabled",
-        "off",
-        "false",
-        "0",
-        "enable",
-        "enabled",
-        "on",
-        "true",
-        "1",
-    ):
+    if chosen not in gl.NAMES:
         yield Finding(
             "MUJOCO_GL", "broken", f"{chosen!r} is no backend: mujoco refuses to start", "unset MUJOCO_GL"
         )
@@ -197,7 +194,7 @@ def _display() -> Iterator[Finding]:
 
 
 def _cores() -> Iterator[Finding]:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    usable = processes.usable_cores()
     names = ("OMP_NUM_THREADS", "LP_NUM_THREADS", "MKL_NUM_THREADS")
     limits = ", ".join(f"{name}={os.environ[name]}" for name in names if name in os.environ)
     text = f"{usable} of {os.cpu_count()} usable" + (f", {limits}" if limits else "")

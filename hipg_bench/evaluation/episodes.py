@@ -57,6 +57,8 @@ class Plan:
         threads: physics threads, 0 for all cores; no result depends on it.
         split: what the team meets beside the task; see `hipg_bench.evaluation.splits`.
         salt: hidden worlds follow from it; None plays the public ones.
+        luck: in hidden worlds, what the agent is told as its own seed follows from this too, so that an
+            agent cannot recognise a world from an earlier evaluation by it.
     """
 
     seed: int = FIRST_SEED
@@ -65,11 +67,18 @@ class Plan:
     threads: int = 0
     split: str = splits.STANDARD
     salt: bytes | None = dataclasses.field(default=None, repr=False)
+    luck: str = ""
 
     def eval_seed(self, task: str, world: int) -> int:
         """The environment's seed in a world."""
         block = world // WORLDS_PER_SEED
         return self.seed + block if self.salt is None else hidden_seed(self.salt, self.split, task, block)
+
+    def agent_seed(self, task: str, world: int) -> int:
+        """The seed that the policy is told for its own chance."""
+        if self.salt is None:
+            return self.eval_seed(task, world)
+        return hidden_seed(self.salt, f"{self.split}|{self.luck}", task, world // WORLDS_PER_SEED)
 
     def told_seed(self, task: str, world: int) -> int | None:
         """The same as a row tells it: nobody may learn a hidden one."""
@@ -163,7 +172,8 @@ class Plan:
         place = splits.setting(self.split, spec)
         ids = np.array([world % WORLDS_PER_SEED for world in worlds])
         seed = self.eval_seed(spec.task, worlds[0])
-        made = Worlds(spec, place, seed, worlds[0] // WORLDS_PER_SEED, ids, threads)
+        told = self.agent_seed(spec.task, worlds[0])
+        made = Worlds(spec, place, seed, worlds[0] // WORLDS_PER_SEED, ids, threads, agent_seed=told)
         return made, Watched(policy, made.env.action_size, alone=len(worlds) == 1)
 
     def _play(self, spec: TaskSpec, policy: Policy, worlds: list[int], advance: Advance) -> list[Row]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -158,11 +159,14 @@ def _make_one(one: Film, stop: threading.Event, advance: Callable[[float], None]
 
 
 def _is_of(saved: Path, row: Row) -> bool:
-    """Whether an episode is already saved, and not another one of an evaluation that was shorter."""
+    """Whether an episode is already saved whole, and not another one of a shorter evaluation."""
     if not saved.exists():
         return False
-    with np.load(saved, allow_pickle=False) as file:
-        return (int(file["train_seed"]), int(file["world"])) == (row["train_seed"], row["world"])
+    try:
+        with np.load(saved, allow_pickle=False) as file:
+            return (int(file["train_seed"]), int(file["world"])) == (row["train_seed"], row["world"])
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        return False  # damaged; it is written anew
 
 
 def _save(agent: Agent, spec: TaskSpec, row: Row, plan: Plan, path: Path) -> None:

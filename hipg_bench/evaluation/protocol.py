@@ -19,7 +19,7 @@ from typing import Any
 from packaging.requirements import Requirement
 
 from hipg_bench import registry
-from hipg_bench.evaluation import splits
+from hipg_bench.evaluation import sources, splits
 from hipg_bench.evaluation.failures import failures_of_a_dnf
 from hipg_bench.evaluation.results import SCHEMA
 from hipg_bench.evaluation.seeds import FIRST_SEED, SUITE, WORLDS_PER_SEED
@@ -30,16 +30,6 @@ BLOCKS = 5
 """Evaluation seeds per task and training seed."""
 EPISODES = BLOCKS * WORLDS_PER_SEED
 """Episodes per task and training seed."""
-_CODE = (
-    *("spec.py", "layout.py", "episode.py", "env.py", "sim.py", "registry.py"),
-    *("mechanics/*.py", "families/*.py"),
-    *(f"policies/{name}.py" for name in ("network", "scripted", "simple")),
-    *(
-        f"evaluation/{name}.py"
-        for name in ("episodes", "failures", "results", "seeds", "splits", "statistics", "worlds")
-    ),
-)
-"""Files of the package that decide how an episode goes and what it counts."""
 _ENGINE = ("mujoco", "numpy", "scipy")
 
 
@@ -141,9 +131,8 @@ def _scales(scales: Mapping[str, Anchors | None]) -> dict[str, list[float]]:
 def _files() -> Iterator[tuple[str, str]]:
     """Every file that decides how an episode goes, with 16 hex digits of its SHA-256."""
     package = Path(__file__).resolve().parents[1]
-    for pattern in _CODE:
-        for path in sorted(package.glob(pattern)):
-            yield f"hipg_bench/{path.relative_to(package).as_posix()}", _digest(path)
+    for path in sources.files():
+        yield f"hipg_bench/{path.as_posix()}", _digest(package / path)
     assets, rules = data_folder("assets"), splits.folder()
     for path in sorted(assets.glob("*.xml")):
         yield f"assets/{path.name}", _digest(path)

@@ -18,22 +18,30 @@ import json
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from hipg_bench.errors import BundleError, ResumeError, UnknownNameError
+from hipg_bench.errors import BundleError, ResumeError, SpecError, UnknownNameError
 from hipg_bench.evaluation import films, protocol, report, splits
 from hipg_bench.evaluation.episodes import Plan, Row, versions
 from hipg_bench.evaluation.failures import NOT_PLAYED, close
 from hipg_bench.evaluation.latency import Stopwatch
 from hipg_bench.evaluation.ranking import kind_of
 from hipg_bench.evaluation.results import SCHEMA, aggregate, summarise
+from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.evaluation.seeds import commitment
-from hipg_bench.paths import write_text
+from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.spec import TaskSpec
 
 Progress = Callable[[str, float], None]
 """Told a task (or ``films``) and how many more of its episodes (or films) are done."""
+
+
+_RECORD = "run.json"
+"""The file that says which evaluation a folder is of."""
+_FOLDERS = ("episodes", "films", "videos")
+_RESULTS = ("results.json", "report.html", "films", "videos")
+"""What an evaluation may overwrite; rows in ``episodes`` are read and gone on with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +73,7 @@ def playable(
             continue
         try:
             splits.setting(split, spec).background_policy(spec)
+            agent.check_distinct(spec.task)
             for train_seed in found:
                 close(agent.policy(spec, train_seed))
             seeds[spec.task] = found
@@ -96,50 +105,52 @@ def evaluate(
 
     Raises:
         BundleError: the agent plays none of the tasks.
-        ResumeError: ``out`` belongs to another evaluation.
+        ResumeError: ``out`` belongs to another evaluation or is used by another process, holds files of
+            somebody's that would be overwritten, or is damaged.
     """
     seeds, skipped = playable(agent, suite, plan.split)
     specs = [splits.with_anchors(plan.split, spec) for spec in suite.specs]
     worlds = {"seed": plan.seed} if plan.salt is None else {"commitment": commitment(plan.salt)}
-    _claim(out, {"agent": agent.name, "split": plan.split, **worlds, "versions": versions()})
-    seconds: dict[str, float] = {}
-    watches: dict[str, Stopwatch] = {}
-    rows: dict[str, list[Row]] = {}
-    for spec in specs:
-        if spec.task in seeds:
-            watches[spec.task] = watch = Stopwatch()
-            with _timed(seconds, spec.task):
-                rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, watch, progress)
-    played = [spec for spec in specs if spec.task in rows]
-    with _timed(seconds, "films"):
-        chosen, trouble = films.choose_all(agent, played, rows, plan, films_per_task, out)
-        made, more_trouble = films.make(chosen, lambda done: progress("films", done))
-    results = {
-        "schema": SCHEMA,
-        "suite": suite.name,
-        "split": plan.split,
-        "protocol": protocol.identity(),
-        "agent": agent.name,
-        "kind": kind_of(agent.card.kind == "builtin", [len(found) for found in seeds.values()]),
-        "agent_summary": agent.summary,
-        "seed": None,
-        "commitment": None,
-        **worlds,
-        "episodes_per_policy": plan.episodes,
-        "versions": versions(),
-        "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in specs]),
-        "tasks": [summarise(spec, rows[spec.task]) for spec in played],
-        "skipped": [{"task": task, "reason": reason} for task, reason in skipped.items()],
-        "films": [{"task": one.spec.task, "file": one.file, "title": one.title} for one in made],
-        "film_trouble": [*trouble, *more_trouble],
-        "timing": {
-            "seconds": seconds,
-            "act_ms": {task: watch.summary() for task, watch in watches.items()},
-        },
-    }
-    write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
-    write_text(out / "report.html", report.render(results, rows, {spec.task: spec for spec in played}))
-    return results
+    run = {"agent": agent.name, "split": plan.split, **worlds, "versions": versions()}
+    with _alone_in(out, run):
+        seconds: dict[str, float] = {}
+        watches: dict[str, Stopwatch] = {}
+        rows: dict[str, list[Row]] = {}
+        for spec in specs:
+            if spec.task in seeds:
+                watches[spec.task] = watch = Stopwatch()
+                with _timed(seconds, spec.task):
+                    rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, watch, progress)
+        played = [spec for spec in specs if spec.task in rows]
+        with _timed(seconds, "films"):
+            chosen, trouble = films.choose_all(agent, played, rows, plan, films_per_task, out)
+            made, more_trouble = films.make(chosen, lambda done: progress("films", done))
+        results = {
+            "schema": SCHEMA,
+            "suite": suite.name,
+            "split": plan.split,
+            "protocol": protocol.identity(),
+            "agent": agent.name,
+            "kind": kind_of(agent.card.kind == "builtin", [len(found) for found in seeds.values()]),
+            "agent_summary": agent.summary,
+            "seed": None,
+            "commitment": None,
+            **worlds,
+            "episodes_per_policy": plan.episodes,
+            "versions": versions(),
+            "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in specs]),
+            "tasks": [summarise(spec, rows[spec.task]) for spec in played],
+            "skipped": [{"task": task, "reason": reason} for task, reason in skipped.items()],
+            "films": [{"task": one.spec.task, "file": one.file, "title": one.title} for one in made],
+            "film_trouble": [*trouble, *more_trouble],
+            "timing": {
+                "seconds": seconds,
+                "act_ms": {task: watch.summary() for task, watch in watches.items()},
+            },
+        }
+        write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
+        write_text(out / "report.html", report.render(results, rows, {spec.task: spec for spec in played}))
+        return results
 
 
 @contextlib.contextmanager
@@ -168,7 +179,7 @@ def _play_task(
         }
         for k in train_seeds
     }  # fmt: skip
-    rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, identity, plan)}
+    rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, spec, identity, plan)}
     progress(spec.task, len(rows))
     for train_seed in train_seeds:
         policy = watch.timed(agent.policy(spec, train_seed))
@@ -180,18 +191,26 @@ def _play_task(
 
 
 def _write_rows(path: Path, rows: Mapping[tuple[int, int], Row]) -> None:
-    write_text(path, "".join(json.dumps(rows[key], allow_nan=False) + "\n" for key in sorted(rows)))
+    write_text(
+        path, "".join(json.dumps(rows[key], allow_nan=False) + "\n" for key in sorted(rows)), sealed=True
+    )
 
 
-def _resumed(path: Path, identity: Mapping[int, Row], plan: Plan) -> list[Row]:
+def _resumed(path: Path, spec: TaskSpec, identity: Mapping[int, Row], plan: Plan) -> list[Row]:
     """Rows of an earlier, interrupted call.
 
     Raises:
-        ResumeError: they are another agent's, task's or plan's.
+        ResumeError: they are another agent's, task's or plan's, or damaged.
     """
     if not path.exists():
         return []
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    check_seal(path)
+    try:
+        rows = read_rows(path.read_bytes(), str(path), spec)
+    except SpecError as error:
+        raise ResumeError(
+            f"{error}; choose another --out, or remove the file to play the task anew"
+        ) from error
     for row in rows:
         expected = identity.get(row["train_seed"])
         if expected is None:
@@ -207,24 +226,41 @@ def _resumed(path: Path, identity: Mapping[int, Row], plan: Plan) -> list[Row]:
     return [row for row in rows if row["status"] != NOT_PLAYED]
 
 
-def _claim(out: Path, run: dict[str, Any]) -> None:
-    """Say whom the folder belongs to, or see that it is ours.
+@contextlib.contextmanager
+def _alone_in(out: Path, run: Mapping[str, Any]) -> Generator[None]:
+    """Hold the folder of an evaluation, new or interrupted earlier.
 
     Raises:
-        ResumeError: it belongs to another evaluation.
+        ResumeError: as `evaluate` says.
     """
-    path = out / "run.json"
-    for folder in (out, *out.glob("*/")):
-        # half-written files of a process that was killed
-        for leftover in folder.glob(".*-[0-9]*.*"):
-            leftover.unlink()
-    if path.exists():
+    _check_belongs(out, run)
+    with output_folder(out, _RECORD, _RESULTS, "evaluating"):
+        _check_belongs(out, run)
+        for folder in (out, *(out / name for name in _FOLDERS)):
+            remove_partial(folder)
+        write_text(out / _RECORD, json.dumps(run, indent=2) + "\n")
+        yield
+
+
+def _check_belongs(out: Path, run: Mapping[str, Any]) -> None:
+    """See that a folder is of this evaluation or of none; nothing in it is changed.
+
+    Raises:
+        ResumeError: it belongs to another evaluation, or ``run.json`` is damaged.
+    """
+    path = out / _RECORD
+    if not path.exists():
+        return
+    try:
         earlier = json.loads(path.read_text(encoding="utf-8"))
-        for name, value in run.items():
-            if earlier.get(name) != value:
-                raise _foreign(path, name, earlier.get(name), value)
-    else:
-        write_text(path, json.dumps(run, indent=2) + "\n")
+    except (ValueError, RecursionError) as error:
+        raise ResumeError(f"{path} is damaged: {error}; choose another --out") from error
+    if not isinstance(earlier, dict):
+        raise ResumeError(f"{path} is damaged: a JSON object is expected; choose another --out")
+    earlier = cast(dict[str, Any], earlier)
+    for name, value in run.items():
+        if earlier.get(name) != value:
+            raise _foreign(path, name, earlier.get(name), value)
 
 
 def _foreign(path: Path, name: str, got: object, expected: object) -> ResumeError:

@@ -198,7 +198,9 @@ class _Reshaped:
         self._shift = shift
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._family, name)
+        if name.startswith("__"):  # what pickle and deepcopy ask for before there is a family
+            raise AttributeError(name)
+        return getattr(self.__dict__["_family"], name)
 
     def scene(self) -> mujoco.MjSpec:
         """Compose the world, then change it."""

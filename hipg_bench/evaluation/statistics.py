@@ -12,10 +12,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
 METHOD_RUNS = 5
 """Fewest training seeds of a method; with fewer an entry is a checkpoint."""
+MOST_RUNS = 10
+"""Training seeds per task that an entry of the board may have: each tells a little of the hidden worlds."""
 CLIP = (-0.5, 1.5)
 """Scores are cut to this in aggregates, so that no single task can carry or sink an agent."""
 _EPISODE_REPS, _REPS = 10_000, 50_000
@@ -48,8 +49,21 @@ def iqm_ci95(
 
 
 def iqm(scores: Drawn) -> Float[np.ndarray, "..."]:
-    """Interquartile mean over all runs and tasks: the mean of the middle half."""
-    return np.asarray(stats.trim_mean(np.concatenate(scores, axis=-1), 0.25, axis=-1))
+    """Interquartile mean over all runs and tasks, the mean of the middle half.
+
+    Every task has the same weight, however many runs it has. With as many runs for every task it is
+    rliable's: a quarter of the scores, rounded down to whole ones, is cut at each end.
+    """
+    most = max(task.shape[-1] for task in scores)
+    pooled = np.concatenate(scores, axis=-1)
+    weight = np.concatenate([np.full(task.shape[-1], 1 / task.shape[-1]) for task in scores]) / len(scores)
+    cut = (len(scores) * most // 4) / (len(scores) * most)
+    order = np.argsort(pooled, axis=-1, kind="stable")
+    above = np.cumsum(weight[order], axis=-1)
+    below = above - weight[order]
+    kept = np.maximum(np.minimum(above, 1 - cut) - np.maximum(below, cut), 0.0)
+    middle = np.take_along_axis(pooled, order, axis=-1) * kept
+    return np.asarray(middle.sum(axis=-1) / kept.sum(axis=-1))
 
 
 def mean(scores: Drawn) -> Float[np.ndarray, "..."]:
@@ -68,9 +82,11 @@ def optimality_gap(scores: Drawn) -> Float[np.ndarray, "..."]:
 
 
 def profile(scores: Drawn, thresholds: Float[np.ndarray, "K"]) -> Float[np.ndarray, "... K"]:
-    """Performance profile: share of (run, task) scores above each threshold."""
-    pooled = np.concatenate(scores, axis=-1)
-    return np.stack([(pooled > threshold).mean(axis=-1) for threshold in thresholds], axis=-1)
+    """Performance profile: share of runs above each threshold, mean over tasks."""
+    return np.stack(
+        [mean([(task > threshold).astype(np.float64) for task in scores]) for threshold in thresholds],
+        axis=-1,
+    )
 
 
 def ci95(

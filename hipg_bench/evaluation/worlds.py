@@ -43,8 +43,9 @@ class Worlds:
     """
 
     def __init__(
-        self, spec: TaskSpec, setting: Setting, seed: int, block: int, ids: Int[np.ndarray, "B"], threads: int
-    ) -> None:
+        self, spec: TaskSpec, setting: Setting, seed: int, block: int, ids: Int[np.ndarray, "B"],
+        threads: int, *, agent_seed: int,
+    ) -> None:  # fmt: skip
         """Build them.
 
         Args:
@@ -54,19 +55,24 @@ class Worlds:
             block: which evaluation seed of the task it is, from 0.
             ids: (B,) episodes.
             threads: physics threads, 0 for all cores.
+            agent_seed: what the policy is told for its own chance.
         """
         self.env: BatchEnv = setting.make(spec, block, len(ids), seed, threads)
         self.others: Bool[np.ndarray, "B N"] = setting.bodies_of_others(seed, ids, spec.num_agents)
         self._doom = setting.doom(seed, ids, spec)
         self._background = setting.background_policy(spec)
         self._seed = seed
+        self._agent_seed = agent_seed
         self._ids = ids
 
     def steps(self, policy: Policy) -> Iterator[Step]:
         """The start, then one step after another, without end."""
         step = self.env.reset(self._ids)
         players = [policy] if self._background is None else [policy, self._background]
-        memory = [one.initial_state(self._seed, self._ids, self.env.num_agents) for one in players]
+        seeds = (self._agent_seed, self._seed)
+        memory = [
+            one.initial_state(seeds[k], self._ids, self.env.num_agents) for k, one in enumerate(players)
+        ]
         while True:
             yield step
             action: list[np.ndarray] = []

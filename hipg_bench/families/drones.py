@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.families.scene import asset, attach
-from hipg_bench.layout import Block, Layout
+from hipg_bench.layout import SHARE, Block, Layout
 from hipg_bench.mechanics import coverage
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params, TaskSpec
@@ -116,8 +116,8 @@ def spread(
 def neighbor_blocks(slots: int, visible: str) -> tuple[Block, ...]:
     """Observation blocks filled by `sensing.write_team`."""
     return (
-        Block("neighbor_seen", (slots,), "1", "-", visible),
-        Block("neighbor_health", (slots,), "1", "-", visible),
+        Block("neighbor_seen", (slots,), "1", "-", visible, limits=SHARE),
+        Block("neighbor_health", (slots,), "1", "-", visible, limits=SHARE),
         Block("neighbor_position", (slots, 3), "m", "own", visible),
         Block("neighbor_velocity", (slots, 3), "m/s", "own", visible),
     )

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from hipg_bench.families import drones
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
-from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.layout import SHARE, Block, Layout, TaskLayout
 from hipg_bench.mechanics import coverage, hazards, health, radio, sensing
 from hipg_bench.native import on_threads
 from hipg_bench.sim import Sim
@@ -84,21 +84,22 @@ class HazardComm:
         within = f"within {params.sensing_radius:g} m"
         self.layout = TaskLayout(
             observation=Layout((
-                Block("health", (1,), "1"),
+                Block("health", (1,), "1", limits=SHARE),
                 Block("velocity", (3,), "m/s", "world"),
                 Block("position", (3,), "m", "world"),
                 Block("terminal_position", (2, 3), "m", "own"),
-                Block("route", (2,), "1", "-", "1 while the network carries messages to that terminal"),
+                Block("route", (2,), "1", "-",
+                      "1 while the network carries messages to that terminal", limits=SHARE),
                 *drones.neighbor_blocks(self._slots, f"{within}, live drones"),
-                Block("wreck_seen", (self._wrecks,), "1", "-", within),
+                Block("wreck_seen", (self._wrecks,), "1", "-", within, limits=SHARE),
                 Block("wreck_position", (self._wrecks, 3), "m", "own", within),
             )),
             action=drones.ACTION,
             state=Layout((
-                Block("health", (n,), "1"),
+                Block("health", (n,), "1", limits=SHARE),
                 Block("position", (n, 3), "m", "world"),
                 Block("velocity", (n, 3), "m/s", "world"),
-                Block("route", (n, 2), "1"),
+                Block("route", (n, 2), "1", limits=SHARE),
                 Block("terminal_position", (2, 3), "m", "world"),
                 Block("hazard_position", (3,), "m", "world"),
             )),

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench.families import drones
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.scene import add_marker
-from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.layout import SHARE, Block, Layout, TaskLayout
 from hipg_bench.mechanics import coverage, hazards, health, sensing
 from hipg_bench.mechanics.few import few
 from hipg_bench.native import on_threads
@@ -91,22 +91,23 @@ class HazardNav:
         within = f"within {params.sensing_radius:g} m"
         self.layout = TaskLayout(
             observation=Layout((
-                Block("health", (1,), "1"),
+                Block("health", (1,), "1", limits=SHARE),
                 Block("velocity", (3,), "m/s", "world"),
                 Block("position", (3,), "m", "world"),
                 Block("point_position", (points, 3), "m", "own", "always, nearest point first"),
-                Block("point_hazardous", (points,), "1", "-", "once any drone came within its radius"),
+                Block("point_hazardous", (points,), "1", "-",
+                      "once any drone came within its radius", limits=SHARE),
                 Block("point_gap", (points,), "m", "-", f"to the nearest other live drone {within}"),
                 *drones.neighbor_blocks(self._slots, within),
             )),
             action=drones.ACTION,
             state=Layout((
-                Block("health", (n,), "1"),
+                Block("health", (n,), "1", limits=SHARE),
                 Block("position", (n, 3), "m", "world"),
                 Block("velocity", (n, 3), "m/s", "world"),
                 Block("point_position", (points, 3), "m", "world"),
-                Block("point_hazardous", (points,), "1"),
-                Block("point_revealed", (points,), "1"),
+                Block("point_hazardous", (points,), "1", limits=SHARE),
+                Block("point_revealed", (points,), "1", limits=SHARE),
             )),
         )  # fmt: skip
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench.families import walker_body
 from hipg_bench.families.family import EVERY, Harm, Rows
 from hipg_bench.families.walker_body import Body, Pose
-from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.layout import SHARE, UNIT, Block, Layout, TaskLayout
 from hipg_bench.sim import Sim
 from hipg_bench.spec import Params as BaseParams
 from hipg_bench.spec import TaskSpec, parse
@@ -306,13 +306,13 @@ class MultiWalker:
     def _observation(self) -> Layout:
         d, there = self._dims, "where there is one, dead or alive"
         return Layout((
-            Block("health", (1,), "1"),
+            Block("health", (1,), "1", limits=SHARE),
             Block("height", (1,), "m", "world"),
             *self._proprioception_blocks(()),
             Block("head_on_plank", (d,), "m", "plank, from one's seat"),
             *self._plank_blocks(),
-            Block("neighbor_there", (2,), "1", "-", "behind, ahead"),
-            Block("neighbor_health", (2,), "1", "-", there),
+            Block("neighbor_there", (2,), "1", "-", "behind, ahead", limits=SHARE),
+            Block("neighbor_health", (2,), "1", "-", there, limits=SHARE),
             Block("neighbor_gap", (2, d), "m", "own place, less the seats' spacing", there),
             Block("neighbor_velocity", (2, d), "m/s", "world, relative", there),
         ))  # fmt: skip
@@ -327,7 +327,7 @@ class MultiWalker:
     def _state(self) -> Layout:
         n, d = self.spec.num_agents, self._dims
         return Layout((
-            Block("health", (n,), "1"),
+            Block("health", (n,), "1", limits=SHARE),
             Block("down", (n,), "control steps off one's feet"),
             Block("place", (n, d), "m", "world, from the plank's middle and one's seat"),
             *self._proprioception_blocks((n,)),
@@ -338,17 +338,19 @@ class MultiWalker:
     def _proprioception_blocks(self, lead: tuple[int, ...]) -> tuple[Block, ...]:
         d, turns, joints = self._dims, self._spins, self.body.joints
         heading = (
-            () if self.params.planar else (Block("heading", (*lead, 3), "1", "world's x axis in the body's"),)
+            ()
+            if self.params.planar
+            else (Block("heading", (*lead, 3), "1", "world's x axis in the body's", limits=UNIT),)
         )
         return (
-            Block("up", (*lead, d), "1", "world's z axis in the body's"),
+            Block("up", (*lead, d), "1", "world's z axis in the body's", limits=UNIT),
             *heading,
             Block("velocity", (*lead, d), "m/s", "body"),
             Block("spin", (*lead, turns), "rad/s", "body"),
             Block("joint", (*lead, 2, joints), "rad"),
             Block("joint_rate", (*lead, 2, joints), "rad/s"),
             Block("touch", (*lead, 2), "1"),
-            Block("action", (*lead, self._servos), "1"),
+            Block("action", (*lead, self._servos), "1", limits=UNIT),
         )
 
     def _plank_blocks(self) -> tuple[Block, ...]:

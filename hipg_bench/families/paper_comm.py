@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench.families import paper_particles as particles
 from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Rows
-from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.layout import SHARE, Block, Layout, TaskLayout
 from hipg_bench.mechanics import looks, plane
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
@@ -74,12 +74,12 @@ class PaperComm(particles.Particles[Snapshot]):
             observation=self._direct_layout() if self._direct else senses.two_steps(self._look_layout),
             action=particles.ACTION,
             state=Layout((
-                Block("terminated", (n,), "1"),
+                Block("terminated", (n,), "1", limits=SHARE),
                 Block("position", (n, 2), "m", "world"),
                 Block("velocity", (n, 2), "m/s", "world"),
                 terminals,
                 Block("hazard_position", (2,), "m", "world"),
-                Block("marker_hazardous", (3,), "1", "-", "terminals 0, hazard 1"),
+                Block("marker_hazardous", (3,), "1", "-", "terminals 0, hazard 1", limits=SHARE),
                 Block("marker_velocity", (3, 2), "m/s", "world", "never: they stand still"),
             )),
             health_block="terminated",
@@ -155,7 +155,8 @@ class PaperComm(particles.Particles[Snapshot]):
         return Layout((
             *senses.own_blocks(),
             Block("terminal_position", (2, 2), "m", "world"),
-            Block("other_terminated", others, "1", "-", f"{heard}, so that it is 0: the dead are silent"),
+            Block("other_terminated", others, "1", "-",
+                  f"{heard}, so that it is 0: the dead are silent", limits=SHARE),
             Block("other_position", (*others, 2), "m", "own", heard),
             Block("other_velocity", (*others, 2), "m/s", "own", heard),
         ))  # fmt: skip

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench.families import paper_particles as particles
 from hipg_bench.families import paper_senses as senses
 from hipg_bench.families.family import EVERY, Rows
-from hipg_bench.layout import Block, Layout, TaskLayout
+from hipg_bench.layout import SHARE, Block, Layout, TaskLayout
 from hipg_bench.mechanics import plane
 from hipg_bench.sim import Sim
 from hipg_bench.spec import TaskSpec, parse
@@ -75,10 +75,10 @@ class PaperNav(particles.Particles[Snapshot]):
             observation=self._direct_layout() if self._direct else senses.two_steps(self._look_layout),
             action=particles.ACTION,
             state=Layout((
-                Block("terminated", (n,), "1"),
+                Block("terminated", (n,), "1", limits=SHARE),
                 Block("position", (n, 2), "m", "world"),
                 Block("velocity", (n, 2), "m/s", "world"),
-                Block("point_hazardous", (points,), "1"),
+                Block("point_hazardous", (points,), "1", limits=SHARE),
                 Block("point_position", (points, 2), "m", "world"),
                 Block("point_velocity", (points, 2), "m/s", "world", "never: landmarks stand still"),
             )),
@@ -167,8 +167,9 @@ class PaperNav(particles.Particles[Snapshot]):
         return Layout((
             *senses.own_blocks(),
             Block("point_position", (self._points, 2), "m", "own"),
-            Block("point_revealed", (self._points,), "1", "-", "1 on hazards that an agent came upon"),
-            Block("other_terminated", others, "1", "-", "1 once dead"),
+            Block("point_revealed", (self._points,), "1", "-",
+                  "1 on hazards that an agent came upon", limits=SHARE),
+            Block("other_terminated", others, "1", "-", "1 once dead", limits=SHARE),
             Block("other_position", (*others, 2), "m", "own", "while that agent lives"),
             Block("other_velocity", (*others, 2), "m/s", "own", "while that agent lives"),
         ))  # fmt: skip

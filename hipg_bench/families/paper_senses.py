@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Float32, Shaped
 
-from hipg_bench.layout import Block, Layout
+from hipg_bench.layout import SHARE, Block, Layout
 from hipg_bench.mechanics import histogram, looks
 from hipg_bench.native import on_threads
 
@@ -28,7 +28,7 @@ class Body(Protocol):
 def own_blocks() -> tuple[Block, ...]:
     """What every observation begins with."""
     return (
-        Block("terminated", (1,), "1", "-", "1 once dead"),
+        Block("terminated", (1,), "1", "-", "1 once dead", limits=SHARE),
         Block("velocity", (2,), "m/s", "world"),
         Block("position", (2,), "m", "world"),
     )

@@ -6,29 +6,36 @@ plays them. Nothing else that a submitter says of results is used.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from hipg_bench.errors import BoardError
-from hipg_bench.evaluation.episodes import Row
+from hipg_bench.errors import BoardError, BundleError
+from hipg_bench.evaluation.failures import OK
+from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.leaderboard import films
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Entry, now
 from hipg_bench.leaderboard.playing import Match, Progress, keep, play, played_tasks, quiet
-from hipg_bench.leaderboard.rows import parse_rows
+from hipg_bench.leaderboard.rows import MOST_BYTES
 from hipg_bench.leaderboard.shown import rows_path, run_path
 from hipg_bench.leaderboard.source import BUNDLE, Source
 from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.registry import task_spec
+from hipg_bench.submissions.check import check
 
 CURVE_POINTS = 300
 """Kept of a learning curve."""
-_MOST_CURVE_BYTES, _MOST_CLAIMED_BYTES = 8_000_000, 64_000_000
+_MOST_CURVE_BYTES = 8_000_000
+_MOST_TOLD = 20
+_LARGEST = 1e15
+"""Largest number of a learning curve."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,10 +69,14 @@ def add(
 
     Raises:
         BoardError: the name is taken, or the claimed rows are none.
-        BundleError: the agent plays none of the tasks.
+        BundleError: `submit check` finds an error, the agent plays none of the tasks, or two of its training
+            seeds played alike.
+        SpecError: the claimed rows are refused.
         ResumeError: the claimed rows are of another agent, suite or version.
     """
     agent = source.agent
+    if source.bundle is not None:
+        _refuse_faulty(agent)
     earlier = board.entry(agent.name) if replace and agent.name in board.names() else None
     with board.draft(agent.name, earlier) as folder:
         _copy_card(source, folder)
@@ -76,7 +87,8 @@ def add(
         hashes: dict[str, str] = {}
         for split in match.splits:
             run = play(agent, match, split, work, progress=progress)
-            hashes |= keep(run, folder, "public", split)
+            _refuse_alike(run)
+            hashes |= keep(run, folder, split)
         _copy_curves(agent, folder)
         _keep_films(board, earlier, hashes, folder)
         trouble = films.make(agent, match, film_tasks, work, folder, progress)
@@ -86,7 +98,7 @@ def add(
         )
         entry = Entry(
             name=agent.name,
-            version=1 if earlier is None else earlier.version + (source.bundle is not None),
+            version=earlier.version if earlier and source.bundle is None else board.next_version(agent.name),
             added=now(),
             suite=agent.card.suite,
             tier=agent.card.tier,
@@ -104,6 +116,20 @@ def add(
         shutil.rmtree(work)
         board.write(folder, entry)
     return Added(entry, tuple(trouble))
+
+
+def _refuse_faulty(agent: Agent) -> None:
+    """Refuse what `submit check` would refuse."""
+    errors = [
+        f"{finding.where}: {finding.what}"
+        for finding in check(agent.folder, trust=agent.trust)
+        if finding.severity == "error"
+    ]
+    if errors:
+        raise BundleError(
+            f"{agent.name} is not ready for the board (`hipg-bench submit check` says what to do):\n  "
+            + "\n  ".join(errors[:_MOST_TOLD])
+        )
 
 
 def _copy_card(source: Source, folder: Path) -> None:
@@ -129,39 +155,36 @@ def _bring(claims: Path, split: str, work: Path) -> bool:
     """Lay claimed rows where the evaluation goes on from them; say whether there are any."""
     found = sorted((claims / split / "episodes").glob("*.jsonl"))
     for path in found:
-        if path.stat().st_size > _MOST_CLAIMED_BYTES:
-            raise BoardError(f"{path}: at most {_MOST_CLAIMED_BYTES} bytes of rows are allowed")
+        if path.stat().st_size > MOST_BYTES:
+            raise BoardError(f"{path}: at most {MOST_BYTES} bytes of rows are allowed")
         text = path.read_bytes()
-        for row in parse_rows(text, path.name):
-            _check(row, path.name)
+        read_rows(text, path.name, task_spec(path.stem))
         target = work / run_path("public", split) / "episodes" / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(text)
     return bool(found)
 
 
-def _check(row: Row, where: str) -> None:
-    """Refuse a row that numbers cannot be computed from; whether they are true, `verify` finds out.
+def _refuse_alike(run: Path) -> None:
+    """Refuse training seeds that played alike in every world: they are copies of one training.
 
     Raises:
-        BoardError: a field is missing, of another type, or not finite.
+        BundleError: there are such.
     """
-    for name, kinds in _FIELDS.items():
-        value = row.get(name, _MISSING)
-        if not isinstance(value, kinds) or (isinstance(value, float) and not math.isfinite(value)):
-            got = "nothing" if value is _MISSING else repr(value)[:60]
-            allowed = " or ".join(kind.__name__ for kind in kinds)
-            raise BoardError(f"{where}: world {row['world']}: {name} is {got}; {allowed} is allowed")
-
-
-_MISSING = object()
-_NUMBER, _MAYBE = (int, float), (int, float, type(None))
-_FIELDS: dict[str, tuple[type, ...]] = {
-    "task": (str,), "split": (str,), "agent": (str,), "policy": (str,), "status": (str,),
-    "end_reason": (str,), "return": _NUMBER, "reached": _MAYBE, "score": _MAYBE, "length": _MAYBE,
-    "survival": _MAYBE, "deaths": _MAYBE, "first_death": _MAYBE, "death_list": (list,), "metrics": (dict,),
-}  # fmt: skip
-"""What a row must hold for its task to be summed up."""
+    for path in sorted((run / "episodes").glob("*.jsonl")):
+        played: dict[int, list[tuple[Any, ...]]] = {}
+        for row in read_rows(path.read_bytes(), str(path), task_spec(path.stem)):
+            if row["status"] == OK:
+                deaths = tuple(death["time"] for death in row["death_list"])
+                played.setdefault(row["train_seed"], []).append((row["world"], row["return"], *deaths))
+        seen: dict[tuple[Any, ...], int] = {}
+        for seed, outcomes in played.items():
+            first = seen.setdefault(tuple(outcomes), seed)
+            if first != seed:
+                raise BundleError(
+                    f"{path.stem}: training seeds {first} and {seed} played alike in all {len(outcomes)} "
+                    f"worlds: every seed must be a training of its own"
+                )
 
 
 def _copy_curves(agent: Agent, folder: Path) -> None:
@@ -174,19 +197,21 @@ def _copy_curves(agent: Agent, folder: Path) -> None:
                 step = math.ceil(len(points) / CURVE_POINTS) or 1
                 # the last point stays
                 lines = [f"{steps:g},{value:.6g}\n" for steps, value in reversed(points[::-1][::step])]
-                if lines:
+                if len(lines) > 1:
                     write_text(
                         folder / "curves" / task / f"seed{seed}.csv", "steps,return\n" + "".join(lines)
                     )
 
 
 def _points(path: Path) -> Iterator[tuple[float, float]]:
-    """The points of a learning curve that are numbers."""
-    with path.open(encoding="utf-8", errors="replace", newline="") as lines:
+    """The points of a learning curve that are numbers and go forward."""
+    last = -1.0
+    with path.open(encoding="utf-8", errors="replace", newline="") as lines, contextlib.suppress(csv.Error):
         for row in csv.DictReader(lines):
             try:
                 steps, value = float(row["steps"]), float(row["return"])
             except (KeyError, TypeError, ValueError):
                 continue
-            if math.isfinite(steps) and math.isfinite(value):
+            if last < steps <= _LARGEST and abs(value) <= _LARGEST:
+                last = steps
                 yield steps, value

@@ -3,29 +3,31 @@
     commitment.json         hash of the salt behind the hidden worlds
     entries/<name>/         what is known of an entry now
     history/<name>/v<k>/    what was known of its earlier versions
-    .draft-*  .ready-*      writers at work, or killed; the next writer cleans up after the dead
+    .hipg-bench-draft-*  -ready-*   writers at work, or killed; the next writer cleans up after the dead
 
 A draft is built beside the entries and takes its place by one rename, so whoever is killed leaves the board
-as it was. Where an entry is replaced, the rename to ``.ready-<name>`` decides; what is left to do
+as it was. Where an entry is replaced, the rename to ``.hipg-bench-ready-<name>`` decides; what is left to do
 after it, the next one who opens the board does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from hipg_bench.errors import BoardError, UnknownNameError, hint
 from hipg_bench.leaderboard.entry import Entry, read_entry
-from hipg_bench.paths import write_text
+from hipg_bench.leaderboard.rows import unpack
+from hipg_bench.paths import replacing, write_text
 
-_DRAFT, _READY = ".draft-", ".ready-"
+_DRAFT, _READY = ".hipg-bench-draft-", ".hipg-bench-ready-"
 
 
 class Board:
@@ -73,25 +75,67 @@ class Board:
         Raises:
             BoardError: the name is taken, or the entry is no longer the one that was read.
         """
-        with self._alone():
-            self._check(name, replaces)
-            draft = Path(tempfile.mkdtemp(prefix=f"{_DRAFT}{name}-", dir=self.root))
-            # held while we live: this tells our draft from one of a dead process
-            alive = FileLock(_lock_of(draft))
-            alive.acquire()
-        try:
+        with self.workspace(name, lambda: self._check(name, replaces)) as draft:
             yield draft
             with self._alone():
                 self._check(name, replaces)
                 self._publish(name, draft, replaces)
+
+    @contextlib.contextmanager
+    def workspace(self, name: str = "work", check: Callable[[], None] = lambda: None) -> Generator[Path]:
+        """Yield an empty folder, which goes at the end; a killed process's goes with the next writer.
+
+        Args:
+            name: part of the folder's.
+            check: called before it is made, while nobody else renames things here.
+        """
+        with self._alone():
+            check()
+            folder = Path(tempfile.mkdtemp(prefix=f"{_DRAFT}{name}-", dir=self.root))
+            # held while we live: this tells our folder from one of a dead process
+            alive = FileLock(_lock_of(folder))
+            alive.acquire()
+        try:
+            yield folder
         finally:
-            shutil.rmtree(draft, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
             alive.release()
-            _lock_of(draft).unlink(missing_ok=True)
+            _lock_of(folder).unlink(missing_ok=True)
+
+    def next_version(self, name: str) -> int:
+        """One more than any version of an entry that the board has or had."""
+        had = [int(path.name[1:]) for path in self._history(name).glob("v*") if path.name[1:].isdecimal()]
+        now = [self.entry(name).version] if name in self._names() else []
+        return 1 + max([*had, *now], default=0)
 
     def write(self, folder: Path, entry: Entry) -> None:
         """Write ``entry.json`` into a draft."""
         write_text(folder / "entry.json", entry.model_dump_json(indent=2) + "\n")
+
+    def publish_rows(self, private: Path) -> tuple[int, list[str]]:
+        """Copy rows of hidden worlds into their entries, now that the salt is known to all.
+
+        Args:
+            private: where they were kept, as `salt.private_folder` says.
+
+        Returns:
+            How many files were copied, and those that are missing or not what their hash promised.
+        """
+        copied, wrong = 0, list[str]()
+        with self._alone():
+            for name in self._names():
+                entry = read_entry(self._place(name))
+                for path, digest in entry.rows.items():
+                    if not path.startswith("hidden/"):
+                        continue
+                    kept = private / name / f"v{entry.version}" / path
+                    if kept.is_file() and hashlib.sha256(unpack(kept)).hexdigest() == digest:
+                        with replacing(self._place(name) / path) as temporary:
+                            shutil.copyfile(kept, temporary)
+                        copied += 1
+                    else:
+                        wrong.append(f"{name}: {path}")
+        return copied, wrong
 
     @contextlib.contextmanager
     def _alone(self) -> Generator[None]:
@@ -104,6 +148,9 @@ class Board:
 
     def _names(self) -> tuple[str, ...]:
         return tuple(sorted(path.parent.name for path in (self.root / "entries").glob("*/entry.json")))
+
+    def _history(self, name: str) -> Path:
+        return self.root / "history" / name
 
     def _place(self, name: str) -> Path:
         return self.root / "entries" / name
@@ -134,8 +181,12 @@ class Board:
         if place.exists():
             earlier = read_entry(place).version
             if earlier < read_entry(ready).version:
-                kept = self.root / "history" / name / f"v{earlier}"
+                kept = self._history(name) / f"v{earlier}"
                 kept.parent.mkdir(parents=True, exist_ok=True)
+                copies = 1
+                while kept.exists():  # somebody moved entries by hand: nothing in the history is overwritten
+                    copies += 1
+                    kept = self._history(name) / f"v{earlier}-{copies}"
                 place.rename(kept)
             else:
                 place.rename(self.root / f"{_DRAFT}{name}-old-{os.getpid()}")

@@ -89,7 +89,8 @@ class Entry(Params):
         sandbox: what kept the agent apart while the board played: as in `Verification`.
         execution: what the submitter declares.
         privileged: whether it acts on the joint state; a reference then, never ranked.
-        rows: path in the entry's folder to the SHA-256 of the rows in it, unpacked.
+        rows: path in the entry's folder to the SHA-256 of the rows in it, unpacked; those of hidden worlds
+            are put there when the salt is revealed.
         verification: the maintainer's, once there is one.
     """
 

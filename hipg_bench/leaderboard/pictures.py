@@ -95,7 +95,9 @@ def agent(one: Shown, specs: Sequence[TaskSpec]) -> dict[str, Any]:
         "by_task": {name: found for name, found in by_task.items() if any(found.values())},
         "unplayed": (one.result("standard") or {"skipped": []})["skipped"],
         "curves": [
-            (spec, _learning([one], spec, colour, alone=True)) for spec in specs if spec.task in one.curves
+            (spec, learning)
+            for spec in specs
+            if (learning := _learning([one], spec, colour, alone=True)) is not None
         ],
         "specs": {spec.task: spec for spec in specs},
     }

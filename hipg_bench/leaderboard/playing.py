@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, cast
 
 from hipg_bench import registry
-from hipg_bench.evaluation import runner
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation import runner, splits
+from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.results import aggregate
+from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.evaluation.splits import SPLITS
 from hipg_bench.leaderboard.rows import pack
 from hipg_bench.leaderboard.shown import Worlds, rows_path, run_path
+from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
 
+ALL = "all"
+"""The table over all families."""
 SUITE = "standard"
 """Tag of the tasks that the board is about."""
 
@@ -46,13 +53,19 @@ class Match:
         """The tasks."""
         return runner.Suite(SUITE, tuple(registry.task_spec(task) for task in self.tasks))
 
-    def plan(self, split: str, salt: bytes | None = None) -> Plan:
-        """The worlds of a split: public ones, or those hidden behind a salt."""
-        return Plan(episodes=self.episodes, threads=self.threads, split=split, salt=salt)
+    def plan(self, split: str, salt: bytes | None = None, luck: str = "") -> Plan:
+        """The worlds of a split: public ones, or those hidden behind a salt; see `Plan` for ``luck``."""
+        return Plan(episodes=self.episodes, threads=self.threads, split=split, salt=salt, luck=luck)
 
 
 def play(
-    agent: Agent, match: Match, split: str, work: Path, salt: bytes | None = None, progress: Progress = quiet
+    agent: Agent,
+    match: Match,
+    split: str,
+    work: Path,
+    salt: bytes | None = None,
+    luck: str = "",
+    progress: Progress = quiet,
 ) -> Path:
     """Play a split, or finish what lies in ``work``; return the evaluation's folder.
 
@@ -68,21 +81,61 @@ def play(
     progress(stage, 0.0, total)
     out = work / run_path(worlds, split)
     runner.evaluate(
-        agent, suite, out, match.plan(split, salt),
+        agent, suite, out, match.plan(split, salt, luck),
         progress=lambda task, done: progress(stage, done, total) if task in seeds else None,
     )  # fmt: skip
     return out
 
 
-def keep(run: Path, entry: Path, worlds: Worlds, split: str) -> dict[str, str]:
-    """Copy results and packed rows into an entry; return the rows' hashes by path."""
-    target = entry / run_path(worlds, split)
+def keep(run: Path, entry: Path, split: str) -> dict[str, str]:
+    """Copy results and packed rows of public worlds into an entry; return the rows' hashes by path."""
+    target = entry / run_path("public", split)
     target.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(run / "results.json", target / "results.json")
+    return _pack_rows(run, entry, "public", split)
+
+
+def keep_hidden(run: Path, entry: Path, private: Path, split: str) -> dict[str, str]:
+    """The same of hidden worlds: rows go to the host's own folder, and rounded results into the entry.
+
+    What an agent saw in a hidden world could be told by what it does in it, and so be read out of its rows.
+    The hashes bind the host to them until the salt is revealed.
+    """
+    result = json.loads((run / "results.json").read_text(encoding="utf-8"))
+    result["tables"] = _by_table(run, split)
+    target = entry / run_path("hidden", split)
+    target.mkdir(parents=True, exist_ok=True)
+    write_text(target / "results.json", json.dumps(_rounded(result), indent=2, allow_nan=False) + "\n")
+    return _pack_rows(run, private, "hidden", split)
+
+
+def _pack_rows(run: Path, folder: Path, worlds: Worlds, split: str) -> dict[str, str]:
     return {
-        (path := rows_path(worlds, split, rows.stem)): pack(rows.read_bytes(), entry / path)
+        (path := rows_path(worlds, split, rows.stem)): pack(rows.read_bytes(), folder / path)
         for rows in sorted((run / "episodes").glob("*.jsonl"))
     }
+
+
+def _by_table(run: Path, split: str) -> dict[str, Any]:
+    """What the suite and each of its families come to, which nobody can compute without the rows."""
+    suite = [splits.with_anchors(split, registry.task_spec(task)) for task in registry.tagged(SUITE)]
+    rows: dict[str, list[Row]] = {}
+    for spec in suite:
+        path = run / "episodes" / f"{spec.task}.jsonl"
+        rows[spec.task] = read_rows(path.read_bytes(), str(path), spec) if path.exists() else []
+    tables = {ALL: suite, **{spec.family: [] for spec in suite}}
+    for spec in suite:
+        tables[spec.family].append(spec)
+    return {name: aggregate([(spec, rows[spec.task]) for spec in chosen]) for name, chosen in tables.items()}
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers with three significant digits, in whatever they stand."""
+    if isinstance(value, float):
+        return float(f"{value:.3g}")
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in cast(dict[str, Any], value).items()}
+    return [_rounded(one) for one in cast(list[Any], value)] if isinstance(value, list) else value
 
 
 def played_tasks(run: Path) -> Sequence[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from hipg_bench.paths import replacing
 Key = tuple[int, int]
 """A row's training seed and world."""
 
+MOST_BYTES = 64_000_000
+"""Of the rows of one task."""
 _SHOWN, _MOST_FIELDS = 60, 12
 """Characters of a value, and fields of a row, that are kept in a difference."""
 
@@ -31,12 +34,16 @@ def unpack(path: Path) -> bytes:
     """Read rows.
 
     Raises:
-        BoardError: the file is damaged.
+        BoardError: the file is damaged, or holds more than rows can take.
     """
     try:
-        return gzip.decompress(path.read_bytes())
-    except (OSError, EOFError) as error:
+        with gzip.open(path) as file:
+            text = file.read(MOST_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as error:
         raise BoardError(f"{path} is damaged: {error}") from error
+    if len(text) > MOST_BYTES:
+        raise BoardError(f"{path}: at most {MOST_BYTES} bytes of rows are allowed")
+    return text
 
 
 def parse_rows(text: bytes, where: str) -> list[dict[str, Any]]:

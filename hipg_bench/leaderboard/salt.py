@@ -121,8 +121,18 @@ def read_salt(board: Path, file: Path) -> bytes:
     return salt
 
 
+def private_folder(file: Path) -> Path:
+    """Where rows of hidden worlds stay until the salt is revealed: beside the salt's file.
+
+    ``<entry>/v<version>/hidden/<split>/episodes/<task>.jsonl.gz``
+    """
+    return file.with_name(f"{file.name}-rows")
+
+
 def reveal_salt(board: Path, file: Path) -> Commitment:
     """Publish the present salt; a new one can be drawn then, and what was verified with this one is outdated.
+
+    Rows of hidden worlds, which `private_folder` holds, can be published then too: `publish_rows`.
 
     Raises:
         BoardError: as `read_salt`.

@@ -83,6 +83,10 @@ class Shown:
         """Task to film."""
         return {path.stem: path for path in sorted(self.folder.glob("films/*.mp4"))}
 
+    def has(self, path: str) -> bool:
+        """Whether a file of rows is there: those of hidden worlds come when the salt is revealed."""
+        return (self.folder / path).is_file()
+
     def text(self, worlds: Worlds, split: str, task: str) -> bytes:
         """The raw rows, a line each.
 

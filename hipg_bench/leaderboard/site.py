@@ -25,17 +25,18 @@ import jinja2
 import markupsafe
 
 from hipg_bench import registry
-from hipg_bench.errors import BoardError
+from hipg_bench.errors import BoardError, HipgError
 from hipg_bench.evaluation import export, splits
 from hipg_bench.leaderboard import pictures, standings
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.salt import Commitments, read_commitments
-from hipg_bench.leaderboard.shown import Shown, read_board
+from hipg_bench.leaderboard.shown import Shown, read_shown
 from hipg_bench.spec import TaskSpec
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _MARK = "hipg-bench-site"
-"""A file that tells a site of ours from a folder that must not be replaced."""
+"""A file that tells a site of ours from a folder that must not be replaced, and lists what is ours in it."""
+_MADE = "made by hipg-bench leaderboard build"
 SPLIT_NAMES = {
     "standard": "Standard",
     "shift": "Shifted physics",
@@ -60,6 +61,7 @@ class View:
     specs: Sequence[TaskSpec]
     panels: Sequence[standings.Panel]
     commitments: Commitments
+    left_out: Mapping[str, str]
 
     @property
     def played(self) -> list[str]:
@@ -72,30 +74,82 @@ class View:
         return pictures.drawn(self.panels[0]) if self.panels else []
 
 
-def build(board: Board, out: Path) -> int:
-    """Write the site into a folder, in place of an earlier one; return how many entries it shows.
+def build(board: Board, out: Path) -> View:
+    """Write the site into a folder, in place of an earlier one; return what it shows.
+
+    Damaged entries are left out, and the page says so. Files that somebody added to an earlier site stay.
 
     Raises:
-        BoardError: the folder holds something else, or the board has no entries or damaged ones.
+        BoardError: the folder holds something else, or the board has no entries that can be shown.
     """
     if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
         raise BoardError(f"{out} holds something else: choose an empty folder for the site")
-    entries = read_board(board)
+    specs = [registry.task_spec(task) for task in registry.tagged("standard")]
+    entries, left_out = _entries(board, specs)
+    if left_out and not entries:
+        raise BoardError(f"no entry of {board.root} can be shown: {next(iter(left_out.values()))}")
     if not entries:
         raise BoardError(f"{board.root} has no entries: add one with `hipg-bench leaderboard add`")
-    specs = [registry.task_spec(task) for task in registry.tagged("standard")]
-    view = View(entries, specs, standings.panels(entries, specs), read_commitments(board.root))
+    panels = standings.panels(entries, specs)
+    view = View(entries, specs, panels, read_commitments(board.root), left_out)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as place:
         fresh, old = Path(place) / "new", Path(place) / "old"
         fresh.mkdir()
-        (fresh / _MARK).write_text("made by hipg-bench leaderboard build\n", encoding="utf-8")
         _pages(view, fresh)
         _data(view, fresh / "data")
+        _write_mark(fresh)
         if out.exists():
             out.rename(old)
         fresh.rename(out)
-    return len(entries)
+        if old.exists():
+            _bring_back(old, out)
+    return view
+
+
+def _entries(board: Board, specs: Sequence[TaskSpec]) -> tuple[list[Shown], dict[str, str]]:
+    """The entries that can be shown, and why the others cannot."""
+    commitment = read_commitments(board.root).sha256
+    entries, left_out = list[Shown](), dict[str, str]()
+    for name in board.names():
+        try:
+            one = read_shown(board.folder(name), commitment)
+            # all that is computed of it, by itself: one entry's damage must not break the page of the others
+            pictures.agent(one, specs)
+            pictures.overview(standings.panels([one], specs), specs)
+            for spec in specs:
+                pictures.task([one], [one], spec)
+        except (
+            HipgError,
+            OSError,
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+        ) as error:
+            left_out[name] = f"{name}: {type(error).__name__}: {error}"
+        else:
+            entries.append(one)
+    return entries, left_out
+
+
+def _write_mark(site: Path) -> None:
+    """Note what belongs to the site: a later build replaces that and nothing else."""
+    files = sorted(path.relative_to(site).as_posix() for path in site.rglob("*") if path.is_file())
+    (site / _MARK).write_text("\n".join([_MADE, *files]) + "\n", encoding="utf-8")
+
+
+def _bring_back(old: Path, new: Path) -> None:
+    """Take over the files of an earlier site that `build` did not write."""
+    ours = {_MARK, *(old / _MARK).read_text(encoding="utf-8").splitlines()}
+    for path in sorted(old.rglob("*")):
+        name = path.relative_to(old)
+        target = new / name
+        added = name.as_posix() not in ours and (path.is_symlink() or not path.is_dir())
+        if added and not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            path.rename(target)
 
 
 def _pages(view: View, out: Path) -> None:
@@ -199,17 +253,17 @@ def _data(view: View, out: Path) -> None:
 
 
 def _marl_eval(entries: Sequence[Shown], split: str) -> export.Document:
-    """A split's episodes in marl-eval's form, of each entry in the worlds that count."""
+    """A split's episodes on public worlds in marl-eval's form: rows of hidden ones are not published."""
     with tempfile.TemporaryDirectory(prefix="hipg-export-") as place:
         folders: list[Path] = []
         for one in entries:
-            result = one.result(split)
+            result = one.results.get(("public", split))
             if result is not None:
                 folder = Path(place) / one.name
                 (folder / "episodes").mkdir(parents=True)
                 (folder / "results.json").write_text(json.dumps(result), encoding="utf-8")
                 for task in result["tasks"]:
-                    rows = one.text(one.worlds, split, task["task"])
+                    rows = one.text("public", split, task["task"])
                     (folder / "episodes" / f"{task['task']}.jsonl").write_bytes(rows)
                 folders.append(folder)
         return export.marl_eval(folders)

@@ -48,11 +48,12 @@ class Source:
 
 
 @contextlib.contextmanager
-def opened(what: str | Path, *, trust: bool = False) -> Generator[Source]:
+def opened(what: str | Path, place: Path | None = None, *, trust: bool = False) -> Generator[Source]:
     """Yield the agent of a bundled name, of a zip, or of a folder (which is packed first).
 
     Args:
         what: which.
+        place: where a folder to unpack it in is made, by default among the system's temporary ones.
         trust: run its code without a sandbox where none is to be had.
 
     Raises:
@@ -62,11 +63,11 @@ def opened(what: str | Path, *, trust: bool = False) -> Generator[Source]:
     if str(what) in agents():
         yield Source(load_agent(what, trust=trust), None)
         return
-    with tempfile.TemporaryDirectory(prefix="hipg-entry-") as place:
+    with tempfile.TemporaryDirectory(prefix="hipg-entry-", dir=place) as folder:
         path = Path(what)
         if path.is_dir():
             load_agent(path)
-            packed = Path(place) / BUNDLE
+            packed = Path(folder) / BUNDLE
             archive.pack(path, packed)
         elif path.is_file():
             packed = path
@@ -74,8 +75,8 @@ def opened(what: str | Path, *, trust: bool = False) -> Generator[Source]:
             # the message names the nearest bundled agent
             load_agent(what)
             raise BundleError(f"{what} is neither a file nor a folder")
-        archive.unpack(packed, Path(place) / "agent")
-        agent = load_agent(Path(place) / "agent", trust=trust)
+        archive.unpack(packed, Path(folder) / "agent")
+        agent = load_agent(Path(folder) / "agent", trust=trust)
         if agent.card.kind == "builtin":
             raise BundleError(f"{what}: kind = 'builtin' is for agents that come with the benchmark")
         if agent.name in agents():
@@ -86,8 +87,8 @@ def opened(what: str | Path, *, trust: bool = False) -> Generator[Source]:
 
 
 @contextlib.contextmanager
-def reopened(folder: Path, entry: Entry, *, trust: bool = False) -> Generator[Source]:
-    """Yield the agent of an entry on the board, as it was submitted.
+def reopened(folder: Path, entry: Entry, place: Path, *, trust: bool = False) -> Generator[Source]:
+    """Yield the agent of an entry on the board, as it was submitted; it is unpacked in ``place``.
 
     Raises:
         BoardError: the submission is not the one that was entered.
@@ -101,5 +102,5 @@ def reopened(folder: Path, entry: Entry, *, trust: bool = False) -> Generator[So
         raise BoardError(f"{folder} holds no {BUNDLE}: get it from where the entry came from")
     if hashlib.sha256(packed.read_bytes()).hexdigest() != entry.bundle:
         raise BoardError(f"{packed} is not what was entered: its SHA-256 differs from entry.json's")
-    with opened(packed, trust=trust) as source:
+    with opened(packed, place, trust=trust) as source:
         yield source

@@ -11,11 +11,9 @@ import numpy as np
 from hipg_bench.evaluation import splits
 from hipg_bench.evaluation.ranking import rank
 from hipg_bench.evaluation.results import aggregate
+from hipg_bench.leaderboard.playing import ALL
 from hipg_bench.leaderboard.shown import Shown
 from hipg_bench.spec import TaskSpec
-
-ALL = "all"
-"""The table over all families."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +91,8 @@ def _panel(entries: Sequence[Shown], specs: Sequence[TaskSpec], split: str, fami
     return Panel(
         split,
         family,
-        _ranked([_line(one, chosen, split) for one in there if one.worlds == "hidden"]),
-        _ranked([_line(one, chosen, split) for one in there if one.worlds == "public"]),
+        _ranked([_line(one, chosen, split, family) for one in there if one.worlds == "hidden"]),
+        _ranked([_line(one, chosen, split, family) for one in there if one.worlds == "public"]),
     )
 
 
@@ -104,19 +102,20 @@ def _scored(one: Shown, split: str) -> bool:
     return result is not None and result["aggregate"]["score_iqm"] is not None
 
 
-def _line(one: Shown, specs: Sequence[TaskSpec], split: str) -> Line:
+def _line(one: Shown, specs: Sequence[TaskSpec], split: str, family: str) -> Line:
     names = [spec.task for spec in specs]
     result = dict(one.result(split) or {})
     tasks = [task for task in result["tasks"] if task["task"] in names]
     anchored = [spec.task for spec in specs if spec.anchors]
-    whole = sorted(result["aggregate"]["scored"]) == sorted(anchored)
-    if result["aggregate"]["scored"] != anchored:
+    if one.worlds == "hidden":
+        result |= {"tasks": tasks, "aggregate": result["tables"][family], "kind": one.kind}
+    elif result["aggregate"]["scored"] != anchored:
         played = {task["task"] for task in tasks}
         rows = [
             (spec, one.rows(one.worlds, split, spec.task) if spec.task in played else []) for spec in specs
         ]
         result |= {"tasks": tasks, "aggregate": aggregate(rows), "kind": one.kind}
-    public = one.results.get(("public", split)) if one.worlds == "hidden" and whole else None
+    public = one.results.get(("public", split)) if one.worlds == "hidden" and family == ALL else None
     return Line(
         shown=one,
         result=result,

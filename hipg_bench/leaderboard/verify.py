@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from hipg_bench import registry
 from hipg_bench.errors import BoardError
-from hipg_bench.evaluation import decentralised, protocol
+from hipg_bench.evaluation import decentralised, machines, protocol
 from hipg_bench.evaluation.episodes import versions
 from hipg_bench.evaluation.seeds import SUITE, commitment
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
-from hipg_bench.leaderboard.playing import Match, Progress, keep, play, quiet
+from hipg_bench.leaderboard.playing import Match, Progress, keep_hidden, play, quiet
 from hipg_bench.leaderboard.rows import compare, unpack
 from hipg_bench.leaderboard.salt import read_commitments
 from hipg_bench.leaderboard.shown import Shown, read_shown, rows_path
@@ -40,7 +39,14 @@ class _Comparison:
 
 
 def verify(
-    board: Board, name: str, salt: bytes, *, trust: bool = False, threads: int = 0, progress: Progress = quiet
+    board: Board,
+    name: str,
+    salt: bytes,
+    private: Path,
+    *,
+    trust: bool = False,
+    threads: int = 0,
+    progress: Progress = quiet,
 ) -> Verification:
     """Check an entry, and write down what came of it; hidden worlds are played only if all rows are true.
 
@@ -48,40 +54,46 @@ def verify(
         board: where.
         name: which entry.
         salt: behind the hidden worlds.
+        private: the host's own folder, where rows of hidden worlds stay until the salt is revealed.
         trust: run its code without a sandbox; it is ``unsandboxed`` then.
         threads: physics threads, 0 for all cores.
         progress: told how far it is.
 
     Raises:
-        BoardError: the tree is not the frozen suite, the salt not the promised one, or the entry is damaged
-            or changed meanwhile.
+        BoardError: the tree is not the frozen suite, this machine not one on which rows come out the same,
+            the salt not the promised one, or the entry is damaged or changed meanwhile.
         UnknownNameError: no such entry.
     """
+    folder = board.folder(name)
     changed = protocol.differences()
     if changed:
         raise BoardError(f"the tree is not {SUITE}, so nothing is verified with it: {changed[0]}")
+    differs = machines.why_rows_may_differ()
+    if differs:
+        raise BoardError(f"nothing is verified here: {differs}")
     promised = read_commitments(board.root).sha256
     if commitment(salt) != promised:
         raise BoardError(f"this salt is not the one that {board.root} is bound to")
-    shown = read_shown(board.folder(name), promised)
+    shown = read_shown(folder, promised)
+    date = now()
+    luck = f"{name}|{shown.entry.version}|{date}"
     with (
-        reopened(shown.folder, shown.entry, trust=trust) as source,
+        board.workspace("verify") as work,
+        reopened(shown.folder, shown.entry, work, trust=trust) as source,
         board.draft(name, shown.entry) as draft,
-        tempfile.TemporaryDirectory(prefix="hipg-verify-") as place,
     ):
-        work = Path(place)
         shutil.copytree(shown.folder, draft, dirs_exist_ok=True)
         shutil.rmtree(draft / "hidden", ignore_errors=True)
         rows = {path: digest for path, digest in shown.entry.rows.items() if not path.startswith("hidden/")}
         seen = _compare(shown, source.agent, work, threads, progress)
-        execution, said = _audit(source.agent, shown, salt)
+        execution, said = _audit(source.agent, shown, salt, luck)
         outcome, reasons = _outcome(shown.entry, source, seen)
         if outcome != "mismatch":
             for split, match in _matches(shown, threads).items():
-                run = play(source.agent, match, split, work, salt, progress)
-                rows |= keep(run, draft, "hidden", split)
+                run = play(source.agent, match, split, work, salt, luck, progress)
+                rows |= keep_hidden(run, draft, private / name / f"v{shown.entry.version}", split)
         found = Verification(
-            date=now(),
+            date=date,
             outcome=outcome,
             commitment=commitment(salt),
             sandbox=source.sandbox,
@@ -132,17 +144,19 @@ def _compare(shown: Shown, agent: Agent, work: Path, threads: int, progress: Pro
     return _Comparison(compared, differences)
 
 
-def _audit(agent: Agent, shown: Shown, salt: bytes) -> tuple[Execution, tuple[str, ...]]:
+def _audit(agent: Agent, shown: Shown, salt: bytes, luck: str) -> tuple[Execution, tuple[str, ...]]:
     """Whether each agent acts on what it sees alone: so by construction, or by replay of code of others."""
     if shown.entry.privileged or agent.card.execution == "centralised":
         return "centralised", ()
     if agent.card.tier != 2:
         return "decentralised", ()
-    plan = Match(episodes=2, threads=1).plan("standard", salt)
+    match = _matches(shown, threads=1).get("standard") or next(iter(_matches(shown, threads=1).values()))
+    plan = match.plan("standard", salt, luck)
+    worlds = next(plan.batches())
     for task, seeds in shown.entry.policies.items():
         spec = registry.task_spec(task)
         for seed in seeds:
-            verdict = decentralised.verify(spec, agent.policy(spec, seed), plan)
+            verdict = decentralised.verify(spec, agent.policy(spec, seed), plan, worlds)
             if not verdict.decentralised:
                 return "centralised", (f"{task}, training seed {seed}: {verdict}",)
     return "decentralised", ()

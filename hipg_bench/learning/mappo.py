@@ -24,7 +24,7 @@ from torch import Tensor
 from hipg_bench.env import BatchEnv, Step
 from hipg_bench.errors import BundleError
 from hipg_bench.layout import TaskLayout
-from hipg_bench.learning import credit, losses
+from hipg_bench.learning import checkpoint, credit, losses
 from hipg_bench.learning.forks import Forks
 from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
@@ -361,16 +361,15 @@ class Trainer:
         }
         if self.forks is not None:
             content["forks"] = torch.from_numpy(self.forks.env.rows)
-        with replacing(path) as temporary:
-            torch.save(content, temporary)
+        checkpoint.save(path, content)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same settings, as if never stopped.
 
         Raises:
-            ResumeError: the checkpoint is of a run with other settings.
+            ResumeError: the checkpoint is of a run with other settings, or damaged.
         """
-        content = torch.load(path, weights_only=True)
+        content = checkpoint.load(path)
         self.settings.check_resumes(content["settings"], path)
         self.iteration = content["iteration"]
         self.entropy_weight = content.get("entropy_weight", self.settings.entropy)

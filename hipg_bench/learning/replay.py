@@ -17,9 +17,9 @@ from torchrl.modules import MultiAgentMLP
 
 from hipg_bench.env import BatchEnv, Step
 from hipg_bench.errors import HipgError, ResumeError
+from hipg_bench.learning import checkpoint
 from hipg_bench.learning.networks import RunningNorm
 from hipg_bench.learning.settings import ReplaySettings
-from hipg_bench.paths import replacing
 from hipg_bench.policies.network import Form, save_network
 from hipg_bench.registry import make
 
@@ -306,17 +306,16 @@ class ReplayTrainer(abc.ABC):
             "random": torch.get_rng_state(),
             "worlds": torch.from_numpy(self.env.rows),
         }
-        with replacing(path) as temporary:
-            torch.save(content, temporary)
+        checkpoint.save(path, content)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint of the same settings, as if never stopped.
 
         Raises:
-            ResumeError: the checkpoint is of a run with other settings, or there is something left to do
-                and the replay is gone.
+            ResumeError: the checkpoint is damaged or of a run with other settings, or there is something
+                left to do and the replay is gone.
         """
-        content = torch.load(path, weights_only=True)
+        content = checkpoint.load(path)
         self.settings.check_resumes(content["settings"], path)
         self.iteration, self.updates = content["iteration"], content["updates"]
         if self.replay.lost and self.iteration < self.settings.iterations:

@@ -16,18 +16,21 @@ from typing import Any, Protocol, runtime_checkable
 
 import mujoco
 import torch
-from filelock import FileLock, Timeout
 from torch.utils.tensorboard import SummaryWriter
 
 from hipg_bench.errors import HipgError, ResumeError
 from hipg_bench.learning import arithmetic, mappo, trial
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
-from hipg_bench.paths import write_text
+from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
 from hipg_bench.policies.network import load_network
 from hipg_bench.registry import task_spec
 
 _REPLAY = "replay"
 """Folder within the run's for what learners keep on disk beside checkpoints."""
+
+_RECORD = "train.json"
+_RESULTS = ("checkpoint.pt", "policy.safetensors", "learner.safetensors", "curve.csv", "tensorboard", _REPLAY)
+"""What a training writes beside it."""
 
 Log = dict[str, float]
 
@@ -101,28 +104,29 @@ def train(
         report: called after every iteration with its number and what was logged.
 
     Raises:
-        ResumeError: the folder holds a run with other settings, or another process is training in it.
+        ResumeError: the folder holds a run with other settings, a damaged one, or files of somebody's that
+            would be overwritten, or another process is training in it.
         BundleError: ``settings.start`` does not fit.
         HipgError: the learner is built on TorchRL, which is not installed.
     """
     arithmetic.prepare()
-    out.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(out / ".lock").acquire(timeout=0):
-            _train_alone(settings, out, command, report)
-    except Timeout as error:
-        raise ResumeError(f"{out}: another process is training here") from error
+    with output_folder(out, _RECORD, _RESULTS, "training"):
+        remove_partial(out)
+        _train_alone(settings, out, command, report)
 
 
 def _train_alone(
     settings: AnySettings, out: Path, command: str, report: Callable[[int, Log], None] | None
 ) -> None:
+    if not (out / _RECORD).exists():
+        write_text(out / _RECORD, _record(settings, command, 0, 0.0))
     learner = new_learner(settings, out)
     checkpoint, curve, policy = out / "checkpoint.pt", out / "curve.csv", out / "policy.safetensors"
     rows: list[dict[str, Any]] = []
     if checkpoint.exists():
+        check_seal(curve)
         learner.resume(checkpoint)
-        rows = list(csv.DictReader(io.StringIO(curve.read_text())))[: learner.iteration]
+        rows = _read_curve(curve, learner.iteration)
     elif isinstance(learner, mappo.Trainer) and learner.settings.start:
         learner.start_from(Path(learner.settings.start))
     before = float(rows[-1]["seconds"]) if rows else 0.0
@@ -144,10 +148,27 @@ def _train_alone(
             # the checkpoint goes last: what it says was done is then on disk
             if isinstance(learner, mappo.Trainer):
                 learner.save_networks(out / "learner.safetensors")
-            write_text(curve, _table(rows))
-            write_text(out / "train.json", _record(settings, command, steps, seconds))
+            write_text(curve, _table(rows), sealed=True)
+            write_text(out / _RECORD, _record(settings, command, steps, seconds))
             learner.save(checkpoint)
-    shutil.rmtree(out / _REPLAY, ignore_errors=True)
+    if not isinstance(learner, mappo.Trainer):
+        shutil.rmtree(out / _REPLAY, ignore_errors=True)
+
+
+def _read_curve(path: Path, iterations: int) -> list[dict[str, Any]]:
+    """The rows of the iterations that the checkpoint knows of.
+
+    Raises:
+        ResumeError: the file is missing, or has fewer or other rows.
+    """
+    try:
+        text = io.StringIO(path.read_text(encoding="utf-8"))
+        rows = list[dict[str, Any]](csv.DictReader(text))[:iterations]
+        if len(rows) == iterations and all(float(row["seconds"]) >= 0 for row in rows):
+            return rows
+    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        pass
+    raise ResumeError(f"{path} is missing or damaged: checkpoint.pt is of {iterations} iterations")
 
 
 def _table(rows: list[dict[str, Any]]) -> str:

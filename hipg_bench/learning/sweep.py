@@ -19,23 +19,27 @@ import itertools
 import json
 import multiprocessing
 import os
+import signal
 import tomllib
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from multiprocessing import connection
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import pydantic
 import torch
 
 from hipg_bench import processes
-from hipg_bench.errors import SpecError
+from hipg_bench.errors import HipgError, ResumeError, SpecError
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, AnySettings
 from hipg_bench.spec import Params, parse
 
 _LOOK_EVERY = 5.0
 """Seconds between two looks at how far the runs are."""
+_PATIENCE = 5.0
+"""Seconds that a process has to end before it is killed."""
 
 
 class Group(Params):
@@ -66,9 +70,20 @@ class Run(NamedTuple):
 
     @property
     def record(self) -> dict[str, Any] | None:
-        """What is on disk: ``train.json``, or None before the first iteration's end."""
+        """What is on disk: ``train.json``, or None before the first iteration's end.
+
+        Raises:
+            ResumeError: the file is damaged.
+        """
         path = self.out / "train.json"
-        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        if not path.exists():
+            return None
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            steps, seconds = int(record["env_steps"]), float(record["seconds"])
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ResumeError(f"{path} is damaged: {error}") from error
+        return {**record, "env_steps": steps, "seconds": seconds} if steps else None
 
     @property
     def done(self) -> int:
@@ -120,7 +135,9 @@ def load(path: Path, out: Path) -> list[Run]:
 
 
 def work_off(runs: list[Run], workers: int, report: Callable[[list[Run]], None]) -> None:
-    """Train what is not finished, ``workers`` runs at a time with one thread each.
+    """Train what is not finished, ``workers`` runs at a time, each in a process with one thread.
+
+    If this is interrupted, the processes end too; the runs go on with the next call.
 
     Args:
         runs: of `load`.
@@ -128,21 +145,59 @@ def work_off(runs: list[Run], workers: int, report: Callable[[list[Run]], None])
         report: called every few seconds with all runs.
 
     Raises:
-        HipgError: what a run raised; the others end first.
+        HipgError: what the first run raised that failed; the others end first.
     """
-    context = multiprocessing.get_context("spawn")
-    os.environ["PYTHONSAFEPATH"] = "1"  # the workers' modules are not taken from the working folder
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting: set[Future[None]] = {
-            pool.submit(_train, run.settings, run.out, run.command) for run in runs if not run.finished
-        }
-        failed: list[Future[None]] = []
-        while waiting:
-            ended, waiting = wait(waiting, _LOOK_EVERY, FIRST_COMPLETED)
-            failed += [run for run in ended if run.exception()]
+    waiting = [run for run in runs if not run.finished]
+    training: dict[int, _Training] = {}
+    failed: list[HipgError] = []
+    try:
+        while waiting or training:
+            while waiting and len(training) < workers:
+                started = _Training(waiting.pop(0))
+                training[started.process.sentinel] = started
+            for sentinel in connection.wait(list(training), _LOOK_EVERY):
+                failed += training.pop(cast(int, sentinel)).failure()
             report(runs)
-    for run in failed:
-        run.result()
+    finally:
+        for left in training.values():
+            left.end()
+    if failed:
+        raise failed[0]
+
+
+class _Training:
+    """A run in a process of its own."""
+
+    def __init__(self, run: Run) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._run = run
+        self._ear, mouth = context.Pipe(duplex=False)
+        self.process = context.Process(
+            target=_train, args=(run.settings, run.out, run.command, mouth), daemon=True
+        )
+        os.environ["PYTHONSAFEPATH"] = "1"  # its modules are not taken from the working folder
+        # Ctrl-C is for this process, which ends the other one
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+        try:
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        mouth.close()
+
+    def failure(self) -> list[HipgError]:
+        """What it raised, once it has ended; nothing, if it ended well."""
+        self.process.join()
+        try:
+            return [HipgError(f"{self._run.out}: {self._ear.recv()}")]
+        except EOFError:
+            code = self.process.exitcode
+            return [] if code == 0 else [HipgError(f"{self._run.out}: the training ended with code {code}")]
+
+    def end(self) -> None:
+        """End it now; its checkpoint is whole."""
+        self.process.terminate()
+        self.process.join(_PATIENCE)
+        self.process.kill()
 
 
 def standings(runs: list[Run], now: float) -> list[Standing]:
@@ -196,14 +251,17 @@ def _runs(group: Group, out: Path) -> Iterator[Run]:
         yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]), labelled)
 
 
-def _train(settings: AnySettings, out: Path, command: str) -> None:
+def _train(settings: AnySettings, out: Path, command: str, mouth: Connection) -> None:
     processes.leave_out_the_working_folder()
     torch.set_num_threads(1)
-    train(settings, out, command=command, report=_stop_when_orphaned)
+    try:
+        train(settings, out, command=command, report=_stop_when_orphaned)
+    except HipgError as error:
+        mouth.send(str(error))
 
 
 def _stop_when_orphaned(iteration: int, log: dict[str, float]) -> None:
-    """End this worker where the sweep's own process was killed, which cannot say so any more."""
+    """End this process where the sweep's own was killed, which cannot say so any more."""
     sweep = multiprocessing.parent_process()
     if sweep is not None and not sweep.is_alive():
-        os._exit(1)  # an exception would end this run alone, and begin the next
+        os._exit(1)

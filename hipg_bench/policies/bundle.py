@@ -18,19 +18,23 @@ from hipg_bench import registry
 from hipg_bench.errors import BundleError, HipgError, UnknownNameError, hint
 from hipg_bench.paths import data_folder
 from hipg_bench.policies.attention import Attention
-from hipg_bench.policies.card import Card, read_card
+from hipg_bench.policies.card import Card, check_regular, read_card
 from hipg_bench.policies.foreign import ForeignPolicy
 from hipg_bench.policies.graph import check_graph
-from hipg_bench.policies.network import load_network
+from hipg_bench.policies.network import load_network, network_digest
 from hipg_bench.policies.policy import Policy
 from hipg_bench.policies.scripted import Scripted
 from hipg_bench.policies.simple import Constant, Random, TimeOnly, Zero
+from hipg_bench.sandbox.files import bundle_files
 from hipg_bench.spec import TaskSpec
 
 
 def _action_size(spec: TaskSpec) -> int:
     return registry.family_of(spec).layout.action.size
 
+
+_SEED_FILE = re.compile(r"seed(0|[1-9][0-9]{0,8})")
+"""What a policy's file is called, but for the ending."""
 
 _BUILTIN: Mapping[str, Callable[[TaskSpec], Policy]] = {
     "zero": lambda spec: Zero(_action_size(spec)),
@@ -77,13 +81,24 @@ class Agent:
         return tuple(sorted({path.parent.name for path in self.folder.glob(f"*/seed*{self._ending}")}))
 
     def train_seeds(self, task: str) -> tuple[int, ...]:
-        """Training seeds with a policy for a task: (0,) for what is not trained, () if there is none."""
+        """Training seeds with a policy for a task: (0,) for what is not trained, () if there is none.
+
+        Raises:
+            BundleError: a file's name is not the only one for its number: ``seed00`` is not allowed.
+        """
         if self.card.kind == "builtin":
             return (0,) if task in self.tasks else ()
         if self.card.kind == "python":
             return tuple(sorted(self.card.tasks.get(task, ())))
         names = [path.stem for path in (self.folder / task).glob(f"seed*{self._ending}")]
-        return tuple(sorted(int(name[4:]) for name in names if re.fullmatch(r"seed\d+", name)))
+        numbered = [name for name in names if re.fullmatch(r"seed[0-9]+", name)]
+        for name in numbered:
+            if not _SEED_FILE.fullmatch(name):
+                raise BundleError(
+                    f"agent {self.name!r}: {task}/{name}{self._ending}: a training seed of at most nine "
+                    f"digits is allowed, without leading zeros, such as seed{int(name[4:13])}{self._ending}"
+                )
+        return tuple(sorted(int(name[4:]) for name in numbered))
 
     def policy(self, spec: TaskSpec, train_seed: int = 0) -> Policy:
         """Load the policy for a task.
@@ -115,6 +130,31 @@ class Agent:
                 content = self._weights(task, train_seed).read_bytes()
         return hashlib.sha256(content).hexdigest()[:12]
 
+    def check_distinct(self, task: str) -> None:
+        """Refuse one policy under several training seeds: it was trained once.
+
+        Policies of Python cannot be compared by content; what they do is compared when they have played.
+
+        Raises:
+            BundleError: two seeds have equal policies.
+        """
+        if self.card.kind in ("builtin", "python"):
+            return
+        seen: dict[str, int] = {}
+        for seed in self.train_seeds(task):
+            content = self._content(task, seed)
+            if content in seen:
+                raise BundleError(
+                    f"agent {self.name!r}: {task}: training seeds {seen[content]} and {seed} are the same "
+                    f"policy: every seed must be a training of its own"
+                )
+            seen[content] = seed
+
+    def _content(self, task: str, train_seed: int) -> str:
+        """A hash of what acts, whatever else is in the file."""
+        path = self._weights(task, train_seed)
+        return network_digest(path) if self.card.kind == "network" else digest(path)
+
     def _digests(self) -> dict[str, str]:
         return {name: digest(path) for name, path in bundle_files(self.folder).items()}
 
@@ -144,9 +184,9 @@ class Agent:
         return network
 
     def _graph(self, spec: TaskSpec, train_seed: int) -> Policy:
-        path, layout = self._weights(spec.task, train_seed), registry.family_of(spec).layout
-        check_graph(path, layout.observation.size, layout.action.size)
-        return self._foreign(spec, train_seed, "onnx_runner", file=path.relative_to(self.folder).as_posix())
+        file = self._weights(spec.task, train_seed).relative_to(self.folder).as_posix()
+        check_graph(self.folder / file, spec, trust=self.trust)
+        return self._foreign(spec, train_seed, "onnx_runner", file=file)
 
     def _foreign(self, spec: TaskSpec, train_seed: int, runner: str, **options: str | None) -> Policy:
         """A policy that acts in a process of its own."""
@@ -159,7 +199,9 @@ class Agent:
 
     def _weights(self, task: str, train_seed: int) -> Path:
         self._check_trained(task, train_seed)
-        return self.folder / task / f"seed{train_seed}{self._ending}"
+        path = self.folder / task / f"seed{train_seed}{self._ending}"
+        check_regular(path)
+        return path
 
     def _check_trained(self, task: str, train_seed: int) -> None:
         """Refuse what it was not trained for."""
@@ -205,24 +247,6 @@ def load_agent(name_or_path: str | Path, *, trust: bool = False) -> Agent:
     if folder.is_dir():
         raise BundleError(f"{folder} holds no agent.toml: it is not an agent bundle")
     raise UnknownNameError(f"no agent {str(name_or_path)!r}{hint(str(name_or_path), agents())}")
-
-
-def bundle_files(folder: Path) -> dict[str, Path]:
-    """The files that belong to a bundle, by their path in it, in order; hidden ones and caches do not.
-
-    Raises:
-        BundleError: something is neither a file nor a folder, such as a link.
-    """
-    found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        inside = path.relative_to(folder)
-        if any(part.startswith(".") or part == "__pycache__" for part in inside.parts):
-            continue
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise BundleError(f"{path}: links and devices are not allowed, only files and folders")
-        if path.is_file():
-            found[inside.as_posix()] = path
-    return found
 
 
 def digest(path: Path) -> str:

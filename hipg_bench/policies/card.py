@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import stat
 import tomllib
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pydantic
 
@@ -15,6 +16,9 @@ Kind = Literal["builtin", "network", "onnx", "python"]
 
 TIERS: dict[str, int] = {"network": 0, "onnx": 1, "python": 2}
 """What may be submitted, by kind: declared networks, ONNX graphs, Python in a sandbox."""
+TaskName = Annotated[str, pydantic.Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
+"""A task's name is used as a folder's."""
+SeedNumber = Annotated[int, pydantic.Field(ge=0, le=999_999_999)]
 _MOST_BYTES = 64 * 1024
 """A card is a page, not a book."""
 
@@ -61,8 +65,8 @@ class Card(Params):
     entry_point: str | None = pydantic.Field(
         default=None, pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$", max_length=200
     )
-    tasks: dict[str, tuple[pydantic.NonNegativeInt, ...]] = pydantic.Field(
-        default_factory=dict[str, tuple[int, ...]]
+    tasks: dict[TaskName, tuple[SeedNumber, ...]] = pydantic.Field(
+        default_factory=dict[str, tuple[int, ...]], max_length=100
     )
     execution: Literal["decentralised", "centralised"] = "decentralised"
     suite: str = pydantic.Field(default="hipg-1", pattern=r"^[a-z0-9-]{1,32}$")
@@ -83,6 +87,7 @@ def read_card(path: Path) -> Card:
     Raises:
         BundleError: it is refused; the message says which field and what is allowed.
     """
+    check_regular(path)
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise BundleError(f"{path}: at most {_MOST_BYTES} bytes are allowed")
@@ -97,6 +102,20 @@ def read_card(path: Path) -> Card:
         raise BundleError(str(error)) from error
     _check_fields_agree(path, card)
     return card
+
+
+def check_regular(path: Path) -> None:
+    """Refuse links, pipes and devices before they are opened: reading one may never end.
+
+    Raises:
+        BundleError: it is no regular file.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except OSError as error:
+        raise BundleError(f"{path}: {error.strerror}") from error
+    if not stat.S_ISREG(mode):
+        raise BundleError(f"{path}: links, pipes and devices are not allowed, only files")
 
 
 def _check_fields_agree(path: Path, card: Card) -> None:

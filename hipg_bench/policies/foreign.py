@@ -71,7 +71,7 @@ class ForeignPolicy:
 
         Args:
             spec: the task.
-            folder: the submission's; the child sees it read-only.
+            folder: the submission's; every child sees a copy of its own, read-only.
             train_seed: told to the agent.
             runner: the module of `sandbox.inside` that makes the agent, e.g. ``python_runner``.
             options: what that module wants to know, e.g. ``{"entry_point": "my_agent:make_agent"}``.
@@ -86,23 +86,8 @@ class ForeignPolicy:
         self._budget = budget
         self._playing: weakref.WeakSet[Child] = weakref.WeakSet()
         self._next: Child | None = None
-        layout = registry.family_of(spec).layout
-        self._action_size = layout.action.size
-        self._setup = {
-            "runner": runner,
-            "options": dict(options),
-            "train_seed": train_seed,
-            "task": {
-                "name": spec.task,
-                "num_agents": spec.num_agents,
-                "observation_size": layout.observation.size,
-                "action_size": layout.action.size,
-                "horizon": spec.horizon,
-                "control_step": spec.control_step,
-                "observation": _blocks(layout.observation),
-                "action": _blocks(layout.action),
-            },
-        }
+        self._action_size = registry.family_of(spec).layout.action.size
+        self._setup = told(spec, train_seed, runner, options)
 
     def initial_state(self, seed: int, episode_id: Int[np.ndarray, "B"], num_agents: int) -> Session:
         """Start a child, let it make its agent and begin B episodes.
@@ -168,6 +153,26 @@ class ForeignPolicy:
                 "not_finite", f"world {world}, agent {agent}, action {axis} is {action[world, agent, axis]}"
             )
         return np.round(action * _GRID) / _GRID, memory
+
+
+def told(spec: TaskSpec, train_seed: int, runner: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """What a child is told: which module of `sandbox.inside` runs, and which task it is for."""
+    layout = registry.family_of(spec).layout
+    return {
+        "runner": runner,
+        "options": dict(options),
+        "train_seed": train_seed,
+        "task": {
+            "name": spec.task,
+            "num_agents": spec.num_agents,
+            "observation_size": layout.observation.size,
+            "action_size": layout.action.size,
+            "horizon": spec.horizon,
+            "control_step": spec.control_step,
+            "observation": _blocks(layout.observation),
+            "action": _blocks(layout.action),
+        },
+    }
 
 
 def agent_seeds(seed: int, episode_id: Int[np.ndarray, "B"]) -> Int[np.ndarray, "B"]:

@@ -6,6 +6,7 @@ checked before anything is read. What may be declared is in a file per kind: `ml
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -72,6 +73,21 @@ def load_network(path: Path) -> Network:
     if isinstance(form, AttentionForm):
         return Attention(tensors, form)
     return GRU(tensors, form) if isinstance(form, GRUForm) else MLP(tensors, form)
+
+
+def network_digest(path: Path) -> str:
+    """A hash of a network's tensors and form: that of a copy with other metadata is the same.
+
+    Raises:
+        BundleError: as `load_network`.
+    """
+    load_network(path)
+    form, tensors = _read(path)
+    seen = hashlib.sha256(f"{form.format} {form.model_dump_json()}".encode())
+    for name in sorted(tensors):
+        seen.update(f"{name} {tensors[name].shape}".encode())
+        seen.update(tensors[name].tobytes())
+    return seen.hexdigest()
 
 
 def _read(path: Path) -> tuple[Form, dict[str, np.ndarray]]:

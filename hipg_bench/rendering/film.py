@@ -149,7 +149,7 @@ def _run_child(folder: Path, backend: str, task: str, progress: Progress | None)
         if not (folder / "done").exists():
             said.seek(0)
             why = gl.last_words(said.read().decode(errors="replace"), code)
-            raise RenderError(f"{task}: no film with {backend}: {why}\nIf OpenGL is missing: {gl.MEND}")
+            raise RenderError(f"{task}: no film with {backend}: {why}{gl.advice(why)}")
 
 
 def _listen(pipe: io.FileIO, progress: Progress | None) -> bool:

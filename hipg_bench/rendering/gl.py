@@ -6,6 +6,8 @@ the child. This module is also that child: ``python -m hipg_bench.rendering.gl``
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
 import functools
 import json
@@ -18,6 +20,11 @@ from hipg_bench import processes
 
 BACKENDS = ("egl", "osmesa")
 """In order of preference: EGL also finds GPUs, OSMesa is software only."""
+NAMES = (
+    "", "egl", "osmesa", "glfw", "glx", "wgl", "cgl", "disable", "disabled", "off", "false", "0", "enable",
+    "enabled", "on", "true", "1",
+)  # fmt: skip
+"""What ``MUJOCO_GL`` may be: with anything else MuJoCo cannot be imported."""
 MEND = "apt-get install -y libegl1 libgl1-mesa-dri libosmesa6"
 """What to run on Debian or Ubuntu when no backend works."""
 
@@ -44,10 +51,21 @@ class Probe:
     error: str
 
 
+def choose_without_display() -> None:
+    """Let libraries that draw in this process use what works without a display, unless the user chose."""
+    if os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY") or sys.platform != "linux":
+        return
+    for backend, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(library)
+            os.environ["MUJOCO_GL"] = backend
+            return
+
+
 def environment(backend: str) -> dict[str, str]:
     """Environment variables under which a child process renders with ``backend``."""
     # software rendering: leave half of the cores to a film beside this one
-    threads = str(max(1, (os.cpu_count() or 1) // 2))
+    threads = str(max(1, processes.usable_cores() // 2))
     threads = os.environ.get("LP_NUM_THREADS", threads)
     return processes.environment(
         LP_NUM_THREADS=threads, MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend, OMP_NUM_THREADS="1"
@@ -82,7 +100,14 @@ def last_words(stderr: str, code: int) -> str:
     # exceptions that are raised while a renderer is torn down come after the one that matters
     said = [line for line in said if not line.startswith(("Exception ignored", "Traceback"))]
     errors = [line for line in said if "Error" in line]
-    return (errors or said or [f"ended with code {code}"])[-1]
+    ended = f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
+    return (errors or ([] if code < 0 else said) or [ended])[-1]
+
+
+def advice(why: str) -> str:
+    """What to install, where a child process failed because OpenGL is missing; else nothing."""
+    missing = any(word in why for word in ("OpenGL", "EGL", "OSMesa", "libGL", "GLError", "GLFW"))
+    return f"\nIf OpenGL is missing: {MEND}" if missing else ""
 
 
 @functools.cache

@@ -16,9 +16,10 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import weakref
 from collections.abc import Iterator
-from typing import IO, Literal, cast
+from typing import IO, Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -66,8 +67,14 @@ class Live:
             check_display()
         self._job = Job(spec=spec, mode=mode)
         self._unseen: list[Float[np.ndarray, "R"]] = []
+        self._last: Float[np.ndarray, "R"] | None = None
         self._child: _Child | None = None
         self._shows = False
+        self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy shows the same world, in a child of its own."""
+        return _copied, (self._job.spec, self._job.mode, self._shows, self._last)
 
     def begin(self, row: Float[np.ndarray, "R"]) -> None:
         """An episode starts: forget what nobody asked to see of the last one."""
@@ -78,6 +85,7 @@ class Live:
     def see(self, row: Float[np.ndarray, "R"]) -> None:
         """The world after a control step; a window shows it, at the pace of the world, until it is closed."""
         self._unseen.append(row)
+        self._last = row
         if self._job.mode == "human" and self._shows:
             self._shows = bool(self._ask(1))
 
@@ -90,7 +98,8 @@ class Live:
         if not self._shows:
             raise RenderError(f"{self._job.spec.task}: nothing to render before reset() and after close()")
         width, height = SIZE
-        return np.frombuffer(self._ask(width * height * 3), np.uint8).reshape(height, width, 3).copy()
+        with self._lock:
+            return np.frombuffer(self._ask(width * height * 3), np.uint8).reshape(height, width, 3).copy()
 
     def close(self) -> None:
         """End the child."""
@@ -100,10 +109,20 @@ class Live:
 
     def _ask(self, size: int) -> bytes:
         """Send the rows that the child has not seen; its answer, empty where its window was closed."""
-        self._child = self._child or _Child(self._job)
+        if self._child and self._child.parent != os.getpid():
+            self._child.end.detach()  # it draws for the process that this one was forked from
+            self._child = None
+        if self._child is None:
+            self._child = _Child(self._job)
+            self._unseen = self._unseen or ([] if self._last is None else [self._last])
         rows = np.stack(self._unseen) if self._unseen else np.empty((0, 0))
         self._unseen.clear()
-        return self._child.ask(_HEAD.pack(*rows.shape) + rows.tobytes(), size)
+        try:
+            return self._child.ask(_HEAD.pack(*rows.shape) + rows.tobytes(), size)
+        except RenderError:
+            self._child.end()
+            self._child = None  # the next picture comes from another one
+            raise
 
 
 class _Child:
@@ -117,6 +136,7 @@ class _Child:
                 f"{job.spec.task}: no OpenGL works, neither {' nor '.join(gl.BACKENDS)}: run\n  {gl.MEND}"
             )
         self._where = f"{job.spec.task}: {backend}"
+        self.parent = os.getpid()
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the child)
         self._process = subprocess.Popen(
             processes.python("-m", __spec__.name, job.model_dump_json()),
@@ -152,7 +172,14 @@ class _Child:
             return b""
         self._stderr.seek(0)
         why = gl.last_words(self._stderr.read().decode(errors="replace"), code)
-        raise RenderError(f"{self._where}: nothing can be shown: {why}\nIf OpenGL is missing: {gl.MEND}")
+        raise RenderError(f"{self._where}: nothing can be shown: {why}{gl.advice(why)}")
+
+
+def _copied(spec: TaskSpec, mode: str, shows: bool, last: Float[np.ndarray, "R"] | None) -> Live:
+    made = Live(spec, mode)
+    if shows and last is not None:
+        made.begin(last)
+    return made
 
 
 def _end(process: subprocess.Popen[bytes], *files: IO[bytes]) -> None:

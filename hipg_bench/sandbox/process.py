@@ -11,6 +11,7 @@ import fcntl
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import time
@@ -22,6 +23,7 @@ from typing import Any
 from hipg_bench.errors import AgentFailure, HostFailure
 from hipg_bench.sandbox.backend import ENVIRONMENT, Backend
 from hipg_bench.sandbox.budget import Budget
+from hipg_bench.sandbox.files import private_copy
 from hipg_bench.sandbox.inside import wire
 
 _MOST_HEADER = 16 << 10
@@ -45,7 +47,8 @@ class Child:
 
         Args:
             backend: how it is locked in.
-            folder: the submission's.
+            folder: the submission's. The child sees a fresh copy of what belongs to it, so that nothing that
+                one leaves on a file, such as the time of its reading, is met by the next.
             setup: what its runner is told: ``runner``, ``options``, ``task``, ``train_seed``.
             budget: its limits.
 
@@ -56,7 +59,8 @@ class Child:
         self._budget = budget
         self._came = bytearray()
         self._ready = False
-        start = backend(folder)
+        place = private_copy(folder)
+        start = backend(place)
         try:
             self._process = subprocess.Popen(
                 start.command,
@@ -64,8 +68,9 @@ class Child:
                 env=dict(ENVIRONMENT), cwd="/", start_new_session=True, bufsize=0,
             )  # fmt: skip
         except OSError as error:
+            shutil.rmtree(place, ignore_errors=True)
             raise HostFailure(f"a child process could not be started: {error}") from error
-        self._finalize = weakref.finalize(self, _end, self._process, os.getpid())
+        self._finalize = weakref.finalize(self, _end, self._process, os.getpid(), place)
         self._in, self._out, self._err = (
             stream.fileno()
             for stream in (self._process.stdin, self._process.stdout, self._process.stderr)
@@ -228,8 +233,8 @@ class Child:
         return f"{text}; it printed:\n{said}" if said else text
 
 
-def _end(process: subprocess.Popen[bytes], owner: int) -> None:
-    """Kill a process and its group, and close its pipes; a fork of the owner leaves it alone."""
+def _end(process: subprocess.Popen[bytes], owner: int, place: Path) -> None:
+    """Kill a process and its group, close its pipes, remove its files; a fork of the owner does nothing."""
     if os.getpid() != owner:
         return
     with contextlib.suppress(ProcessLookupError):
@@ -239,6 +244,7 @@ def _end(process: subprocess.Popen[bytes], owner: int) -> None:
     for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
             stream.close()
+    shutil.rmtree(place, ignore_errors=True)
 
 
 def _plain(text: object) -> str:

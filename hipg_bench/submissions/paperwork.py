@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from hipg_bench import registry
 from hipg_bench.errors import BundleError, hint
 from hipg_bench.evaluation.seeds import SUITE
-from hipg_bench.evaluation.statistics import METHOD_RUNS
+from hipg_bench.evaluation.statistics import METHOD_RUNS, MOST_RUNS
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.policies.card import Card
 from hipg_bench.submissions.archive import check_name, check_sizes
@@ -173,6 +173,16 @@ def look_at_tasks(agent: Agent) -> Iterator[Finding]:
             "tasks", f"no policy for {', '.join(missing)}: each counts as 0 in the suite's score, as random",
             f"train on them too, and add such as {lies}",
         )  # fmt: skip
+    for task in played:
+        if len(seeds[task]) > MOST_RUNS:
+            yield error(
+                "tasks", f"{task} has {len(seeds[task])} training seeds; at most {MOST_RUNS} are allowed",
+                "keep the first ones, chosen before their scores were known",
+            )  # fmt: skip
+        try:
+            agent.check_distinct(task)
+        except BundleError as trouble:
+            yield error(task, str(trouble), "train each seed from the start, or keep one of the files")
     fewest = min(len(seeds[task]) for task in played)
     if fewest < METHOD_RUNS:
         yield advice(

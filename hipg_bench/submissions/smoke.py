@@ -124,7 +124,7 @@ def try_weights(agent: Agent, spec: TaskSpec, train_seed: int) -> Iterator[Findi
 
 def try_alone(agent: Agent, spec: TaskSpec, train_seed: int) -> Iterator[Finding]:
     """Whether agents act on their own observations alone, as the card says."""
-    verdict = verify(spec, agent.policy(spec, train_seed), _PLAN, worlds=[0])
+    verdict = verify(spec, agent.policy(spec, train_seed), _PLAN, _WORLDS)
     if verdict.decentralised:
         yield fine(spec.task, str(verdict))
     else:

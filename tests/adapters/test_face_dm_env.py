@@ -99,7 +99,7 @@ def test_random_is_a_seed_a_state_or_nothing():
         (("hazard_nv", "4"), None, None, UnknownNameError, "did you mean 'hazard_nav-4'"),
         (("hazard_nav", "5"), None, None, UnknownNameError, "did you mean 'hazard_nav-"),
         (("hazard_nav", "4"), {"hazard_peek": 0.5}, None, SpecError, "did you mean 'hazard_peak'"),
-        (("hazard_nav", "4"), {"random": -1}, None, SpecError, "seed >= 0"),
+        (("hazard_nav", "4"), {"random": -1}, None, SpecError, "seed = -1 is refused: a whole number"),
         (("hazard_nav", "4"), None, {"flat_observation": True}, SpecError, "no field 'flat_observation'"),
     ],
 )

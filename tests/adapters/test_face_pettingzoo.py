@@ -148,13 +148,17 @@ def test_pettingzoo_makes_every_task_by_its_id():
     assert env.task_spec.horizon == 7
 
 
-def test_pickle_and_deepcopy_start_anew():
-    env = hipg_bench.parallel_env(TASK, dead="ghost", seed=5, **DEADLY[TASK])
-    first, _ = env.reset()
+def test_pickle_and_deepcopy_go_on_where_it_was():
+    env = hipg_bench.parallel_env(TASK, dead="ghost", **DEADLY[TASK])
+    env.reset()
     env.step({agent: np.zeros(3) for agent in env.agents})
-    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
-        again, _ = twin.reset()
-        np.testing.assert_array_equal(again["agent_2"], first["agent_2"])
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    action = {agent: np.full(3, 0.5) for agent in env.agents}
+    seen = env.step(action)[0]
+    following, _ = env.reset()
+    for twin in twins:
+        np.testing.assert_array_equal(twin.step(action)[0]["agent_2"], seen["agent_2"])
+        np.testing.assert_array_equal(twin.reset()[0]["agent_2"], following["agent_2"])
         assert twin.task_spec == env.task_spec
 
 
@@ -207,16 +211,22 @@ def test_pictures_show_what_has_changed(task):
 
 
 @pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.MEND}")
-def test_a_renderer_that_dies_is_an_error_and_not_a_hang():
-    env = hipg_bench.parallel_env("coop_nav-3", render_mode="rgb_array")
-    env.reset()
-    env.render()
+def test_a_renderer_that_dies_is_an_error_and_the_next_picture_comes_from_another():
+    env, other = (hipg_bench.parallel_env("coop_nav-3", render_mode="rgb_array", seed=3) for _ in range(2))
+    for one in (env, other):
+        one.reset()
+        one.render()
     env._live._child._process.kill()
-    for _ in range(2):
-        env.step({agent: np.zeros(3) for agent in env.agents})
-        with pytest.raises(hipg_bench.errors.RenderError, match=r"coop_nav-3: .*ended with code -9"):
-            env.render()
+    with pytest.raises(hipg_bench.errors.RenderError, match=r"coop_nav-3: .*ended by signal 9") as caught:
+        env.render()
+    assert "apt-get" not in str(caught.value)  # OpenGL works: nothing is missing
+    np.testing.assert_array_equal(env.render(), other.render())
+    for one in (env, other):
+        one.step({agent: np.zeros(3) for agent in one.agents})
+    # interpolated motion begins anew in the second child, so a few pixels may differ
+    assert np.abs(env.render().astype(int) - other.render()).mean() < 1
     env.close()
+    other.close()
 
 
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="no virtual display")

@@ -42,7 +42,7 @@ def same(a, b):
 )
 @pytest.mark.parametrize("num_envs", [1, 5])
 def test_the_specification_holds(task, overrides, num_envs):
-    env = HipgEnv(task, num_envs, **overrides)
+    env = HipgEnv(task, num_envs, 0, **overrides)
     check_env_specs(env, seed=0)
     check_env_specs(env, break_when_any_done="both")
     check_env_specs(TransformedEnv(env, RewardSum(in_keys=[env.reward_key])))
@@ -84,7 +84,7 @@ def test_worlds_agree_with_the_batch_bit_for_bit_through_deaths_and_restarts():
 
 
 def test_a_partial_reset_leaves_other_worlds_as_they_were():
-    env = HipgEnv(TASK, WORLDS, **DEADLY)
+    env = HipgEnv(TASK, WORLDS, 0, **DEADLY)
     now = env.reset()
     for action in actions(env, 4):
         now = env.step(now.set(("agents", "action"), action))["next"].exclude(("agents", "reward"))
@@ -99,7 +99,7 @@ def test_a_partial_reset_leaves_other_worlds_as_they_were():
 
 
 def test_whole_episodes_of_all_worlds_in_which_those_that_are_over_stand_still():
-    env, free = HipgEnv("multiwalker-3", WORLDS), HipgEnv("multiwalker-3", WORLDS)
+    env, free = HipgEnv("multiwalker-3", WORLDS, 0), HipgEnv("multiwalker-3", WORLDS, 0)
     tape = env.rollout(400, player(env, 400), break_when_any_done=False, break_when_all_done=True)
     done = tape["next", "done"][..., 0]
     first = done.int().argmax(dim=1)
@@ -116,7 +116,7 @@ def test_whole_episodes_of_all_worlds_in_which_those_that_are_over_stand_still()
 
 
 def test_a_world_that_is_left_out_of_a_step_is_where_it_was():
-    env, other = (HipgEnv(TASK, 2, **DEADLY | {"hazard_peak": 0.0}) for _ in range(2))
+    env, other = (HipgEnv(TASK, 2, 0, **DEADLY | {"hazard_peak": 0.0}) for _ in range(2))
     first, second = actions(env, 2)
     now, same_now = env.reset(), other.reset()
     left_out = now.clone().set("_step", torch.tensor([True, False])).set(("agents", "action"), first)
@@ -142,7 +142,7 @@ def test_a_seed_fixes_whole_episodes_whenever_it_is_set():
 
 
 def test_the_team_goes_on_being_paid_where_the_task_says_so():
-    env = HipgEnv(TASK, WORLDS, reward_dead="team", **DEADLY)
+    env = HipgEnv(TASK, WORLDS, 0, reward_dead="team", **DEADLY)
     tape = env.rollout(60, break_when_any_done=False)
     reward, alive = tape["next", "agents", "reward"], tape["agents", "alive"]
     assert not alive.all()
@@ -152,7 +152,7 @@ def test_the_team_goes_on_being_paid_where_the_task_says_so():
 
 
 def test_the_arrays_are_the_worlds_own_and_later_steps_leave_them_alone():
-    env = HipgEnv(TASK, WORLDS, **DEADLY)
+    env = HipgEnv(TASK, WORLDS, 0, **DEADLY)
     now, kept = env.reset(), []
     for action in actions(env, 30):
         shown, now = env.step_and_maybe_reset(now.set(("agents", "action"), action))
@@ -161,7 +161,7 @@ def test_the_arrays_are_the_worlds_own_and_later_steps_leave_them_alone():
 
 
 def test_a_collector_takes_whole_batches():
-    env = HipgEnv(TASK, WORLDS, **DEADLY)
+    env = HipgEnv(TASK, WORLDS, 0, **DEADLY)
     collector = Collector(env, None, frames_per_batch=WORLDS * 20, total_frames=WORLDS * 60)
     batches = list(collector)
     collector.shutdown()
@@ -177,7 +177,7 @@ def test_a_collector_takes_whole_batches():
 
 
 def test_actions_that_are_refused():
-    env = HipgEnv(TASK, WORLDS)
+    env = HipgEnv(TASK, WORLDS, 0)
     now = env.reset()
     bad = actions(env, 1)[0]
     bad[4, 2, 1] = float("nan")
@@ -188,7 +188,7 @@ def test_actions_that_are_refused():
 
 
 def test_worlds_that_are_over_or_not_begun_or_closed_refuse_a_step():
-    env = HipgEnv(TASK, WORLDS, **DEADLY | {"hazard_peak": 0.9})
+    env = HipgEnv(TASK, WORLDS, 0, **DEADLY | {"hazard_peak": 0.9})
     action = env.rand_action()
     with pytest.raises(HipgError, match=f"{TASK}: env 0 .* waits for reset"):
         env.step(action)
@@ -207,7 +207,7 @@ def test_worlds_that_are_over_or_not_begun_or_closed_refuse_a_step():
 def test_what_cannot_be_built():
     with pytest.raises(UnknownNameError, match="did you mean 'hazard_nav-4'"):
         HipgEnv("hazard_nv-4")
-    with pytest.raises(SpecError, match="num_envs >= 1"):
+    with pytest.raises(SpecError, match="num_envs = 0 is refused"):
         HipgEnv(TASK, 0)
     with pytest.raises(SpecError, match="did you mean 'hazard_peak'"):
         HipgEnv(TASK, hazard_peek=0.1)

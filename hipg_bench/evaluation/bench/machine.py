@@ -8,15 +8,12 @@ import platform
 from pathlib import Path
 from typing import Any
 
+from hipg_bench.processes import usable_cores
+
 _PACKAGES = (
     "hipg-bench", "mujoco", "numpy", "scipy", "torch", "gymnasium", "pettingzoo", "dm-env", "torchrl",
     "tensordict", "stable-baselines3", "ray", "imageio-ffmpeg",
 )  # fmt: skip
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def machine() -> dict[str, Any]:

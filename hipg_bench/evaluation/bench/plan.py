@@ -10,12 +10,13 @@ from hipg_bench.errors import RenderError
 from hipg_bench.evaluation.bench import films
 from hipg_bench.evaluation.bench.child import Job
 from hipg_bench.evaluation.bench.faces import overheads
-from hipg_bench.evaluation.bench.machine import usable_cores, versions
+from hipg_bench.evaluation.bench.machine import versions
 from hipg_bench.evaluation.bench.scaling import over_agents, over_worlds
 from hipg_bench.evaluation.bench.scoring import scoring_time
 from hipg_bench.evaluation.bench.start import start_times
 from hipg_bench.evaluation.bench.steps import reset_time, step_rate
 from hipg_bench.policies.bundle import load_agent
+from hipg_bench.processes import usable_cores
 from hipg_bench.rendering import gl
 from hipg_bench.spec import TaskSpec
 

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 from . import confine, wire
 
-_RUNNERS = ("python_runner", "onnx_runner", "probe_runner")
+_RUNNERS = ("python_runner", "onnx_runner", "graph_checker", "probe_runner")
 
 
 class Answerer(Protocol):

@@ -1,14 +1,15 @@
 """Tier 1: an ONNX graph, asked for one agent of one world at a time.
 
-The parent has looked at what the file consists of; `onnx.checker` and ONNX Runtime, which are large programs
-in C++, meet it here, where they can do no harm.
+What it consists of is looked at first; `onnx.checker` and ONNX Runtime, which are large programs in C++, meet
+it here, where they can do no harm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
+
+from . import graph_checker
 
 
 def make(setup: Mapping[str, Any]) -> Any:
@@ -20,7 +21,7 @@ def make(setup: Mapping[str, Any]) -> Any:
     import onnx
     import onnxruntime
 
-    content = (Path(setup["folder"]) / setup["options"]["file"]).read_bytes()
+    content = graph_checker.read_graph(setup)
     onnx.checker.check_model(content, full_check=True)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
