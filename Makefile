@@ -6,6 +6,8 @@
 
 BIN := .venv/bin
 READY := .venv/.ready
+READY_FOR_TESTS := .venv/.tests-ready
+CORES ?= $(shell nproc)
 AGENT ?= mappo_minhealth
 ARGS ?=
 
@@ -17,11 +19,14 @@ setup: $(READY) ## virtual environment, pinned packages, libraries for video
 $(READY): pyproject.toml constraints.txt scripts/setup.sh
 	scripts/setup.sh
 
+$(READY_FOR_TESTS): $(READY) scripts/setup.sh
+	scripts/setup.sh --tests
+
 evaluate: $(READY) ## score an agent on the standard suite, with films
 	$(BIN)/hipg-bench evaluate --agent $(AGENT) $(ARGS)
 
-test: $(READY) ## the tests, some minutes
-	$(BIN)/pytest $(ARGS)
+test: $(READY) $(READY_FOR_TESTS) ## the tests, some minutes, on all cores; says what was skipped and why
+	$(BIN)/pytest -n $(CORES) --dist loadscope $(ARGS)
 
 test-rllib: ## the RLlib face, in an environment of its own
 	scripts/test_beside.sh rllib $(ARGS)

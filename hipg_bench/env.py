@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from hipg_bench import episode
 from hipg_bench.arguments import MOST_EPISODE, MOST_SEED, numbers, whole
 from hipg_bench.episode import NEVER, memory_fields
-from hipg_bench.errors import ActionError, HipgError
+from hipg_bench.errors import ActionError, HipgError, SpecError
 from hipg_bench.families.family import Family, Harm
 from hipg_bench.families.scene import without_visuals
 from hipg_bench.layout import TaskLayout
@@ -26,7 +26,11 @@ def world_model(spec: TaskSpec, family: Family, *, visual: bool = False) -> mujo
     """Compile a task's world; the state rows are the same with and without what only a camera sees."""
     scene = family.scene() if visual else without_visuals(family.scene())
     scene.nuserdata = sum(memory_fields(spec, family).values())
-    return scene.compile()
+    try:
+        return scene.compile()
+    except ValueError as error:
+        said = " ".join(str(error).split())
+        raise SpecError(f"{spec.task}: MuJoCo refuses a world with these numbers: {said}") from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +185,7 @@ class BatchEnv:
         now = family.remember(sim, was, now)
 
         # the team is paid, and told how it ended
-        terms = {name: self.spec.weights[name] * term for name, term in family.reward(was, now).items()}
+        terms = self._weighted(family.reward(was, now))
         ruled, reason = family.terminated(now)
         terminated = ruled | diverged
         truncated = ~terminated & (field["elapsed"][:, 0] >= self.spec.horizon)
@@ -343,6 +347,14 @@ class BatchEnv:
             field["death_time"][died] = field["elapsed"][died[0], 0]
             field["death_cause"][died] = harm.cause[died]
             sim.disable(now.health == 0)
+
+    def _weighted(self, terms: Mapping[str, Float[np.ndarray, "B"]]) -> dict[str, Float[np.ndarray, "B"]]:
+        """The family's terms times the task's weights."""
+        weights = self.spec.weights
+        if not terms.keys() <= weights.keys():
+            missing = ", ".join(sorted(terms.keys() - weights.keys()))
+            raise SpecError(f"{self.spec.task}: weights need {missing}, the family's reward terms")
+        return {name: weights[name] * term for name, term in terms.items()}
 
     def _pay_floor(
         self, terms: dict[str, Float[np.ndarray, "B"]], diverged: Bool[np.ndarray, "B"]

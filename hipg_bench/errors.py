@@ -65,6 +65,18 @@ class ResumeError(HipgError, RuntimeError):
     """An output folder that belongs to another run."""
 
 
+def shown(value: object) -> str:
+    """A value for an error message: short, whatever it is."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no whole number of thousands of digits
+        return f"a {type(value).__name__} of thousands of digits"
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+_SHOWN = 120
+
+
 def hint(name: str, allowed: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the nearest allowed name, else what is allowed."""
     names = sorted(allowed)

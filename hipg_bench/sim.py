@@ -22,6 +22,10 @@ _BAD_PHYSICS = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarnin
 """Warnings of positions, velocities or accelerations that are not numbers, or huge."""
 
 
+_QUIET = 1
+"""Where their counts begin: MuJoCo prints the first of a kind, and writes a file into the working folder."""
+
+
 class Sim:
     """B worlds of one model.
 
@@ -81,6 +85,7 @@ class Sim:
         self._default = self._default_row()
         self._disabled = self.batch.expand("opt.disableactuator")
         self._bad = self.batch.warning[:, _BAD_PHYSICS, 1]
+        self._bad[:] = _QUIET
 
     @property
     def num_envs(self) -> int:
@@ -104,7 +109,7 @@ class Sim:
             pose, so that everything read from them is finite, and must be reset.
         """
         self.batch.step(nstep=self._decimation)
-        diverged = self._bad.any(axis=1)
+        diverged = (self._bad > _QUIET).any(axis=1)
         if diverged.any():
             self.position[diverged] = self.model.qpos0
             self.velocity[diverged] = 0.0
@@ -116,6 +121,7 @@ class Sim:
         # what the engine's own reset does to a row, without waking its threads
         self.batch.state[ids] = self._default
         self.batch.warning[ids] = 0
+        self._bad[ids] = _QUIET
         self._disabled[ids] = 0
 
     @property

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
+import numpy as np
 import pydantic
 
-from hipg_bench.errors import SpecError, hint
+from hipg_bench.documents import read_toml
+from hipg_bench.errors import SpecError, hint, shown
 
 M = TypeVar("M", bound=pydantic.BaseModel)
 
@@ -83,7 +84,7 @@ class TaskSpec(Params):
     summary: str
     num_agents: int = pydantic.Field(ge=2, le=31)
     horizon: int = pydantic.Field(ge=1, le=100_000)
-    control_step: float = pydantic.Field(gt=0)
+    control_step: float = pydantic.Field(gt=0, le=10)
     clip_actions: bool = True
     graded_health: bool = False
     reward_dead: Literal["none", "team"] = "none"
@@ -125,6 +126,7 @@ class TaskSpec(Params):
         Raises:
             SpecError: unknown field, or a value that is not allowed.
         """
+        changes = {name: _plain(value, f"{self.task}: {name}") for name, value in changes.items()}
         values = self.model_dump()
         own = {"num_agents", "horizon", "control_step", "clip_actions", "graded_health"}
         own |= {"reward_dead", "dead_observation"}
@@ -133,7 +135,7 @@ class TaskSpec(Params):
                 values[name] = value
             elif name == "weights":
                 if not isinstance(value, Mapping):
-                    raise SpecError(f"{self.task}: weights = {value!r} is refused: a mapping is allowed")
+                    raise SpecError(f"{self.task}: weights = {shown(value)} is refused: a mapping is allowed")
                 unknown = set(value) - set(self.weights)
                 if unknown:
                     raise SpecError(
@@ -152,6 +154,24 @@ class TaskSpec(Params):
         return changed.model_copy(update={"anchors": None, "calibration": {}})
 
 
+def _plain(value: Any, what: str) -> Any:
+    """A value as a task file could hold it; NumPy's numbers become Python's.
+
+    Raises:
+        SpecError: a task file could not.
+    """
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        values = cast(Mapping[Any, Any], value)
+        return {name: _plain(one, f"{what}.{name}") for name, one in values.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one, what) for one in cast(list[Any], value)]
+    if not isinstance(value, str | int | float | bool | None):
+        raise SpecError(f"{what} = {shown(value)} is refused: numbers, text and lists of these are allowed")
+    return value
+
+
 def parse(kind: type[M], values: dict[str, Any], where: str) -> M:
     """Validate ``values`` as ``kind``.
 
@@ -168,7 +188,7 @@ def parse(kind: type[M], values: dict[str, Any], where: str) -> M:
             raise SpecError(f"{where}: no field {field!r}{hint(field, kind.model_fields)}") from error
         if first["type"] == "missing":
             raise SpecError(f"{where}: {field} is required and missing") from error
-        raise SpecError(f"{where}: {field} = {first['input']!r} is refused: {first['msg']}") from error
+        raise SpecError(f"{where}: {field} = {shown(first['input'])} is refused: {first['msg']}") from error
 
 
 def load(path: Path) -> TaskSpec:
@@ -177,11 +197,7 @@ def load(path: Path) -> TaskSpec:
     Raises:
         SpecError: the file does not hold a valid task, or its name is not the task's.
     """
-    try:
-        values = tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"{path}: not TOML: {error}") from error
-    spec = parse(TaskSpec, values, str(path))
+    spec = parse(TaskSpec, read_toml(path), str(path))
     if spec.task != path.stem:
         raise SpecError(f"{path}: holds the task {spec.task!r}; a task file is named after its task")
     return spec

@@ -3,6 +3,7 @@
 # libraries that render video without a screen. Safe to run again; `make` runs it when it is needed.
 #
 #   PYTHON=python3.12 scripts/setup.sh    use this Python instead of the newest one found
+#   scripts/setup.sh --tests              a browser and a virtual display, which only the tests use
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -105,6 +106,26 @@ install_sandbox() {
     fi
 }
 
+# --- what only the tests use ------------------------------------------------------------------------
+install_for_tests() {
+    local missing=()
+    command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null ||
+        missing+=(chromium)
+    command -v xvfb-run >/dev/null || missing+=(xvfb xauth)
+    if [ ${#missing[@]} = 0 ]; then return; fi
+    if may_apt; then
+        say "installing a browser and a virtual display for the tests: ${missing[*]}"
+        apt_install "${missing[@]}"
+    else
+        say "some tests need ${missing[*]} and will be skipped. To add them:  sudo apt-get install ${missing[*]}"
+    fi
+}
+
+if [ "${1:-}" = --tests ]; then
+    install_for_tests
+    touch .venv/.tests-ready
+    exit
+fi
 make_venv
 install_packages
 install_gl

@@ -72,7 +72,7 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._spec
 
     @spec.setter
-    def spec(self, registered: EnvSpec | None) -> None:
+    def spec(self, registered: EnvSpec | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         self._spec = told_horizon(registered, self.task_spec)
 
     def reset(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any
 
 import typer
@@ -75,4 +74,6 @@ def _facts(agent: Any) -> dict[str, Any]:
 
 def _command(path: Any) -> str:
     """The command that trained a policy, where the bundle tells it."""
-    return str(json.loads(path.read_text(encoding="utf-8")).get("command", "")) if path.is_file() else ""
+    from hipg_bench.documents import read_json
+
+    return str(read_json(path).get("command", "")) if path.is_file() else ""

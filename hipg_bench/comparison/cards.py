@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hipg_bench.documents import read_json
 from hipg_bench.policies.card import read_card
 
 _SUMMARIES = {
@@ -38,7 +38,7 @@ def readme(folder: Path) -> str:
     lines = [f"# {card.name}", "", f"{card.summary}.", "", _ABOUT]
     for task in sorted({path.parent.name for path in folder.glob("*/seed*.json")}):
         records = {
-            int(path.stem.removeprefix("seed")): json.loads(path.read_text(encoding="utf-8"))
+            int(path.stem.removeprefix("seed")): read_json(path)
             for path in (folder / task).glob("seed*.json")
             if re.fullmatch(r"seed\d+", path.stem)
         }

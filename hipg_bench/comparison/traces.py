@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 import re
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hipg_bench.comparison.artefacts import BUNDLES
+from hipg_bench.documents import read_json
 from hipg_bench.registry import tasks
 from hipg_bench.spec import TaskSpec
 
@@ -101,7 +101,7 @@ def _read(path: Path, arm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Tr
         seed: of the training.
         tried: the periodic evaluations' returns; else those of the training's own episodes.
     """
-    record = json.loads(path.with_name(f"seed{seed}.json").read_text(encoding="utf-8"))
+    record = read_json(path.with_name(f"seed{seed}.json"))
     column = "eval_return" if tried else "return"
     if not tried and record.get("settings", {}).get("weights"):
         return None  # training paid for other things

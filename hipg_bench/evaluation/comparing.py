@@ -2,30 +2,87 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import pydantic
 
+from hipg_bench.documents import read_json
 from hipg_bench.errors import HipgError
+from hipg_bench.evaluation.episodes import Row
+from hipg_bench.evaluation.results import SCHEMA
+from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.evaluation.statistics import Interval, paired_difference
+from hipg_bench.paths import check_seal
+from hipg_bench.registry import task_spec
+from hipg_bench.spec import parse
 
 _SAME = ("split", "seed", "commitment", "episodes_per_policy")
 """What two evaluations must share, so that they met the same worlds."""
+
+
+class _Document(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="ignore", allow_inf_nan=False)
+
+
+class _Run(_Document):
+    train_seed: int
+    score: float | None
+
+
+class _Task(_Document):
+    task: str
+    fingerprint: str
+    score: float | None
+    runs: tuple[_Run, ...] = pydantic.Field(min_length=1)
+
+
+class _Aggregate(_Document):
+    scored: tuple[str, ...]
+    score_iqm: float | None
+    score_iqm_ci95: tuple[float, float] | None
+
+
+class _Results(_Document):
+    """What comparisons need of ``results.json``; the rest is in ``docs/protocol.md``."""
+
+    schema_: Literal[2] = pydantic.Field(alias="schema")
+    suite: str
+    split: str
+    agent: str
+    kind: Literal["method", "checkpoint", "reference"]
+    aggregate: _Aggregate
+    tasks: tuple[_Task, ...]
 
 
 def read(folder: Path) -> dict[str, Any]:
     """What ``results.json`` of a finished evaluation holds.
 
     Raises:
-        HipgError: there is none.
+        HipgError: there is none, it is damaged, or of another schema.
     """
     path = folder / "results.json"
     if not path.is_file():
         raise HipgError(f"{folder} holds no results.json: it is not a finished evaluation")
-    return json.loads(path.read_text(encoding="utf-8"))
+    results = read_json(path)
+    if results.get("schema") != SCHEMA:
+        raise HipgError(f"{path}: schema {SCHEMA} is allowed, got {results.get('schema')}: evaluate again")
+    parse(_Results, results, str(path))
+    return results
+
+
+def rows_of(folder: Path, task: str) -> list[Row]:
+    """The rows of a task of an evaluation.
+
+    Raises:
+        HipgError: they are missing or damaged.
+    """
+    spec = task_spec(task)  # a name of ours, before it becomes part of a path
+    path = folder / "episodes" / f"{task}.jsonl"
+    check_seal(path)
+    return read_rows(path.read_bytes(), str(path), spec)
 
 
 def differences(ours: Path, theirs: Path) -> Mapping[str, tuple[float, Interval]]:
@@ -53,8 +110,9 @@ def differences(ours: Path, theirs: Path) -> Mapping[str, tuple[float, Interval]
 
 def _scores(folder: Path, task: str) -> np.ndarray:
     """Score of every training run (first axis) in every world."""
-    lines = (folder / "episodes" / f"{task}.jsonl").read_text(encoding="utf-8").splitlines()
-    rows = [json.loads(line) for line in lines]
+    rows = rows_of(folder, task)
     runs = len({row["train_seed"] for row in rows})
     # rows are in the order of training seeds, then worlds
+    if len(rows) % runs or any(row["score"] is None for row in rows):
+        raise HipgError(f"{folder}: {task}: a training seed has no score in some worlds: finish it first")
     return np.array([row["score"] for row in rows]).reshape(runs, -1)

@@ -7,15 +7,13 @@ marl-eval normalises with the lowest and highest value present; our ``score`` ne
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from hipg_bench.errors import HipgError
-from hipg_bench.evaluation.comparing import read
+from hipg_bench.evaluation.comparing import read, rows_of
 from hipg_bench.evaluation.episodes import Row
-from hipg_bench.evaluation.results import SCHEMA
 from hipg_bench.evaluation.splits import STANDARD
 
 _ENVIRONMENT = "hipg_bench"
@@ -35,24 +33,15 @@ def marl_eval(folders: Sequence[Path]) -> Document:
     """
     document: Document = {}
     for folder in folders:
-        results = _results(folder)
+        results = read(folder)
         split = results["split"]
         tasks = document.setdefault(_ENVIRONMENT if split == STANDARD else f"{_ENVIRONMENT}_{split}", {})
         for task in (one["task"] for one in results["tasks"]):
             algorithms = tasks.setdefault(task, {})
             if results["agent"] in algorithms:
                 raise HipgError(f"{folder}: {results['agent']} on {task}, {split}, is there already")
-            path = folder / "episodes" / f"{task}.jsonl"
-            rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-            algorithms[results["agent"]] = _runs(rows)
+            algorithms[results["agent"]] = _runs(rows_of(folder, task))
     return document
-
-
-def _results(folder: Path) -> dict[str, Any]:
-    results = read(folder)
-    if results.get("schema") != SCHEMA:
-        raise HipgError(f"{folder}: schema {SCHEMA} is allowed, got {results.get('schema')}: evaluate again")
-    return results
 
 
 def _runs(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:

@@ -22,9 +22,9 @@ _SHOWN = 60
 
 _Name = Annotated[str, pydantic.Field(max_length=100)]
 _Count = Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST)]
-_Number = Annotated[float, pydantic.Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
-_Time = Annotated[float, pydantic.Field(ge=0, le=1e9, allow_inf_nan=False)]
-_Share = Annotated[float, pydantic.Field(ge=0, le=1, allow_inf_nan=False)]
+_Number = Annotated[float, pydantic.Field(strict=True, ge=-1e12, le=1e12)]
+_Time = Annotated[float, pydantic.Field(strict=True, ge=0, le=1e9)]
+_Share = Annotated[float, pydantic.Field(strict=True, ge=0, le=1)]
 
 
 class _Death(Params):

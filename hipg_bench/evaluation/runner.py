@@ -18,8 +18,9 @@ import json
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
+from hipg_bench.documents import read_json
 from hipg_bench.errors import BundleError, ResumeError, SpecError, UnknownNameError
 from hipg_bench.evaluation import films, protocol, report, splits
 from hipg_bench.evaluation.episodes import Plan, Row, versions
@@ -252,12 +253,9 @@ def _check_belongs(out: Path, run: Mapping[str, Any]) -> None:
     if not path.exists():
         return
     try:
-        earlier = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ResumeError(f"{path} is damaged: {error}; choose another --out") from error
-    if not isinstance(earlier, dict):
-        raise ResumeError(f"{path} is damaged: a JSON object is expected; choose another --out")
-    earlier = cast(dict[str, Any], earlier)
+        earlier = read_json(path)
+    except SpecError as error:
+        raise ResumeError(f"{path.name} is damaged: {error}; choose another --out") from error
     for name, value in run.items():
         if earlier.get(name) != value:
             raise _foreign(path, name, earlier.get(name), value)

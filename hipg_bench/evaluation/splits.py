@@ -9,7 +9,6 @@ anchors measured under them in ``tasks/splits/anchors.toml``, by task.
 from __future__ import annotations
 
 import functools
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -20,8 +19,9 @@ import pydantic
 from jaxtyping import Bool, Int
 
 from hipg_bench import registry
+from hipg_bench.documents import read_toml
 from hipg_bench.env import BatchEnv
-from hipg_bench.errors import BundleError, SpecError, UnknownNameError, hint
+from hipg_bench.errors import BundleError, UnknownNameError, hint
 from hipg_bench.families.family import Family
 from hipg_bench.paths import data_folder
 from hipg_bench.policies.network import load_network
@@ -159,7 +159,7 @@ def anchors() -> Mapping[str, Mapping[str, Anchors]]:
     path = folder() / "anchors.toml"
     return {
         split: {task: parse(Anchors, values, f"{path}: {split}.{task}") for task, values in tasks.items()}
-        for split, tasks in _toml(path).items()
+        for split, tasks in read_toml(path).items()
     }
 
 
@@ -172,14 +172,7 @@ def folder() -> Path:
 def _rules(split: str) -> Mapping[str, Setting]:
     """Family to what a split does to it."""
     path = folder() / f"{split}.toml"
-    return {family: parse(Setting, values, f"{path}: {family}") for family, values in _toml(path).items()}
-
-
-def _toml(path: Path) -> dict[str, dict[str, Any]]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"{path}: not TOML: {error}") from error
+    return {family: parse(Setting, values, f"{path}: {family}") for family, values in read_toml(path).items()}
 
 
 def _chances(seed: int, purpose: int, ids: Int[np.ndarray, "B"]) -> list[np.random.Generator]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import datetime
-import json
 from pathlib import Path
 from typing import Any, Literal
 
 import pydantic
 
-from hipg_bench.errors import SpecError
+from hipg_bench.documents import read_json
 from hipg_bench.spec import Params, parse
 
 SCHEMA = 1
@@ -130,7 +129,4 @@ def read_entry(folder: Path) -> Entry:
         SpecError: it is damaged.
     """
     path = folder / "entry.json"
-    try:
-        return parse(Entry, json.loads(path.read_text(encoding="utf-8")), str(path))
-    except json.JSONDecodeError as error:
-        raise SpecError(f"{path}: not JSON: {error}") from error
+    return parse(Entry, read_json(path), str(path))

@@ -6,12 +6,12 @@ choose worlds afterwards; once the salt is revealed, everybody can play the hidd
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 from pathlib import Path
 
-from hipg_bench.errors import BoardError, SpecError
+from hipg_bench.documents import read_json
+from hipg_bench.errors import BoardError
 from hipg_bench.evaluation.seeds import commitment
 from hipg_bench.leaderboard.entry import now
 from hipg_bench.paths import write_text
@@ -59,10 +59,7 @@ def read_commitments(board: Path) -> Commitments:
     path = board / "commitment.json"
     if not path.exists():
         return Commitments()
-    try:
-        return parse(Commitments, json.loads(path.read_text(encoding="utf-8")), str(path))
-    except json.JSONDecodeError as error:
-        raise SpecError(f"{path}: not JSON: {error}") from error
+    return parse(Commitments, read_json(path), str(path))
 
 
 def new_salt(board: Path, file: Path, suite: str) -> Commitment:

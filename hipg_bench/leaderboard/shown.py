@@ -6,11 +6,11 @@ import csv
 import dataclasses
 import functools
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from hipg_bench.documents import read_json
 from hipg_bench.errors import BoardError
 from hipg_bench.evaluation.ranking import Kind, kind_of
 from hipg_bench.evaluation.splits import SPLITS
@@ -135,7 +135,7 @@ def read_shown(folder: Path, commitment: str | None) -> Shown:
     entry = read_entry(folder)
     readme = folder / "README.md"
     results: dict[tuple[Worlds, str], Any] = {
-        (worlds, split): json.loads(path.read_text(encoding="utf-8"))
+        (worlds, split): read_json(path)
         for worlds in WORLDS
         for split in SPLITS
         if (path := folder / run_path(worlds, split) / "results.json").is_file()

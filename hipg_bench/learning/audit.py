@@ -24,6 +24,7 @@ from torch import Tensor
 
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import HipgError
+from hipg_bench.learning import checkpoint
 from hipg_bench.learning.credit import with_each_dead
 from hipg_bench.learning.mappo import networks
 from hipg_bench.learning.networks import Actor, Critic
@@ -190,7 +191,7 @@ def load(path: Path) -> tuple[Actor, Critic, Settings]:
 
 def _checkpoint(path: Path) -> tuple[dict[str, dict[str, Tensor]], str]:
     """State dictionaries and settings of a run of one's own."""
-    content = torch.load(path, weights_only=True)
+    content = checkpoint.load(path)
     return {part: content[part] for part in ("actor", "critic") if part in content}, content["settings"]
 
 

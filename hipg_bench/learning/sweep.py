@@ -20,7 +20,6 @@ import json
 import multiprocessing
 import os
 import signal
-import tomllib
 from collections.abc import Callable, Iterator
 from multiprocessing import connection
 from multiprocessing.connection import Connection
@@ -31,6 +30,7 @@ import pydantic
 import torch
 
 from hipg_bench import processes
+from hipg_bench.documents import read_json, read_toml
 from hipg_bench.errors import HipgError, ResumeError, SpecError
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, AnySettings
@@ -73,15 +73,15 @@ class Run(NamedTuple):
         """What is on disk: ``train.json``, or None before the first iteration's end.
 
         Raises:
-            ResumeError: the file is damaged.
+            HipgError: the file is damaged.
         """
         path = self.out / "train.json"
         if not path.exists():
             return None
+        record = read_json(path)
         try:
-            record = json.loads(path.read_text(encoding="utf-8"))
             steps, seconds = int(record["env_steps"]), float(record["seconds"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise ResumeError(f"{path} is damaged: {error}") from error
         return {**record, "env_steps": steps, "seconds": seconds} if steps else None
 
@@ -121,11 +121,7 @@ def load(path: Path, out: Path) -> list[Run]:
         SpecError: not readable, a field or setting that is not allowed, or two runs in one folder.
         UnknownNameError: no such task.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SpecError(f"{path} is not a readable sweep file: {error}") from error
-    sweep = parse(Sweep, content, str(path))
+    sweep = parse(Sweep, read_toml(path), str(path))
     runs = [run for group in sweep.run for run in _runs(group, out)]
     folders = [run.out for run in runs]
     if len(set(folders)) < len(folders):

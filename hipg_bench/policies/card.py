@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import stat
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
 import pydantic
 
+from hipg_bench.documents import read_toml
 from hipg_bench.errors import BundleError, SpecError
 from hipg_bench.spec import Params, parse
 
@@ -91,15 +91,14 @@ def read_card(path: Path) -> Card:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise BundleError(f"{path}: at most {_MOST_BYTES} bytes are allowed")
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise BundleError(f"{path}: {error}") from error
-    try:
+        values = read_toml(path)
         if isinstance(values.get("training"), dict):  # by itself: its fields' nearest names are its own
             parse(Training, values["training"], f"{path}: [training]")
         card = parse(Card, values, str(path))
     except SpecError as error:
         raise BundleError(str(error)) from error
+    except OSError as error:
+        raise BundleError(f"{path}: {error.strerror}") from error
     _check_fields_agree(path, card)
     return card
 

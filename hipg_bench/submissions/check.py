@@ -43,9 +43,12 @@ def check(folder: Path, *, trust: bool = False) -> Iterator[Finding]:
     yield from look_at_files(card, files)
     if card.tier is None:
         return
-    yield from look_at_tasks(agent)
-    missing = list(_look_at_module(agent))
-    yield from missing or _play(agent)
+    try:
+        yield from look_at_tasks(agent)
+        missing = list(_look_at_module(agent))
+        yield from missing or _play(agent)
+    except BundleError as trouble:  # of a file's name or kind, wherever it was met first
+        yield error("files", str(trouble), "docs/submit.md says where files lie and what they are called")
 
 
 def _without_card(folder: Path) -> Finding:
