@@ -7,9 +7,11 @@ what a world gets depends neither on the other worlds nor on the number of threa
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import os
+import pickle
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import FunctionType
@@ -37,25 +39,52 @@ class compiled(Generic[P, R]):  # noqa: N801 (a decorator)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Run the machine code."""
-        return self.native(*args, **kwargs)
+        try:
+            return self.native(*args, **kwargs)
+        except _NO_CACHE:  # what was kept is damaged, or the disk is full: compile without it
+            self._forget()
+            self.native = self._compiled(cache=False)
+            return self.native(*args, **kwargs)
 
     @functools.cached_property
     def native(self) -> Callable[P, R]:
         """The machine code, which runs without the interpreter's lock."""
+        try:
+            return self._compiled(cache=True)
+        except RuntimeError:  # there is nowhere to keep it
+            return self._compiled(cache=False)
+
+    def _compiled(self, *, cache: bool) -> Callable[P, R]:
         # half a second for which only those who step worlds need to wait
         import numba
 
         plain = self._function
-        scope = plain.__globals__
-        called = {name: scope[name] for name in plain.__code__.co_names if name in scope}
-        natives = {name: value.native for name, value in called.items() if isinstance(value, compiled)}
-        linked = FunctionType(plain.__code__, scope | natives, plain.__name__)
+        natives = {
+            name: called.native if cache else called._compiled(cache=False)
+            for name, called in self._called().items()
+        }
+        linked = FunctionType(plain.__code__, plain.__globals__ | natives, plain.__name__)
         linked.__qualname__ = plain.__qualname__
         compiler: Any = numba.njit
-        try:
-            return compiler(linked, nogil=True, cache=True)
-        except RuntimeError:  # there is nowhere to keep it
-            return compiler(linked, nogil=True)
+        return compiler(linked, nogil=True, cache=cache)
+
+    def _called(self) -> dict[str, compiled[..., Any]]:
+        """The compiled functions that this one calls, by name."""
+        scope = self._function.__globals__
+        names = [name for name in self._function.__code__.co_names if name in scope]
+        return {name: scope[name] for name in names if isinstance(scope[name], compiled)}
+
+    def _forget(self) -> None:
+        """Let Numba forget what it kept of this function and those it calls, so that it is kept anew."""
+        for called in self._called().values():
+            called._forget()
+        native: Any = self.native
+        with contextlib.suppress(OSError, AttributeError):
+            native._cache.flush()
+
+
+_NO_CACHE = (EOFError, OSError, pickle.UnpicklingError, AttributeError, ImportError, KeyError, IndexError)
+"""What reading damaged machine code, or writing it to a full disk, raises; our loops raise nothing."""
 
 
 def on_threads(work: Callable[[slice], None], worlds: int, threads: int) -> None:

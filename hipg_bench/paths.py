@@ -33,6 +33,11 @@ def data_folder(kind: str) -> Path:
     )
 
 
+def is_installed() -> bool:
+    """Whether the suite's data belong to an installed package, and not to a checkout."""
+    return (_PACKAGE / "data").is_dir()
+
+
 LOCK = ".hipg-bench.lock"
 """The file in an output folder that the process working there holds."""
 PARTIAL = ".hipg-bench-partial-"

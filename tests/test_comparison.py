@@ -21,10 +21,10 @@ from hipg_bench.registry import task_spec, tasks
 STEPS = np.linspace(1e4, 1e6, 50)
 
 
-def run(arm, task, seed, final, score=None):
+def run(arm, task, seed, final, score=None, warm=False):
     """A run that rises straight to what it reaches."""
     score = final * STEPS / STEPS[-1] if score is None else score
-    return Trace(arm, task, seed, STEPS, score, True, final)
+    return Trace(arm, task, seed, STEPS, score, True, warm, final)
 
 
 def named(judged, words, suite="paper"):
@@ -78,18 +78,20 @@ def test_nothing_between_the_arms_is_undecided() -> None:
         claims.verdict(improvement([(rng.normal(size=4), rng.normal(size=4)) for _ in range(3)], reps=400))
         for _ in range(200)
     ]
-    passed = sum(one != "undecided" for one in verdicts)
+    passed = sum(one in ("holds", "does not hold") for one in verdicts)
     assert passed <= 20, "binomial(200, .05) exceeds 20 once in a thousand"
 
 
 @pytest.mark.parametrize(
     ("found", "verdict"),
     [
-        (Improvement(0.9, (0.6, 1.0), 0.01), "holds"),
-        (Improvement(0.9, (0.6, 1.0), 0.06), "undecided"),
-        (Improvement(0.7, (0.4, 0.9), 0.01), "undecided"),
-        (Improvement(0.1, (0.0, 0.3), 0.01), "does not hold"),
-        (Improvement(0.1, (0.0, 0.3), 0.2), "undecided"),
+        (Improvement(0.9, (0.6, 1.0), (0.7, 1.0), 0.01), "holds"),
+        (Improvement(0.9, (0.6, 1.0), (0.7, 1.0), 0.06), "undecided"),
+        (Improvement(0.7, (0.4, 0.9), (0.45, 0.85), 0.01), "undecided"),
+        (Improvement(0.1, (0.0, 0.3), (0.0, 0.25), 0.01), "does not hold"),
+        (Improvement(0.1, (0.0, 0.3), (0.0, 0.25), 0.2), "undecided"),
+        (Improvement(0.52, (0.42, 0.61), (0.44, 0.59), 0.7), "no difference"),
+        (Improvement(0.52, (0.38, 0.66), (0.41, 0.61), 0.7), "undecided"),
     ],
 )
 def test_the_rule(found: Improvement, verdict: str) -> None:
@@ -115,12 +117,42 @@ def test_tasks_with_too_few_runs_are_left_out_and_named() -> None:
     runs += [run("central", "paper_nav-4", seed, 0.8) for seed in range(4)]
     runs += [run("min_health", "paper_nav-8", 0, 0.9), run("central", "paper_nav-8", 0, 0.1)]
     judged = claims.judge_all(runs)
-    level, apart = named(judged, "min-health is above central"), named(judged, "differ less")
+    level = named(judged, "min-health is above central")
     assert level.strata == ("paper_nav-4", "paper_nav-8")
     assert "paper_comm-10" in level.missing
     assert level.runs == (5, 5)
-    assert apart.strata == ("paper_nav-4",), "one run has no distance from another"
-    assert "paper_nav-8" in apart.missing
+
+
+def test_runs_that_began_with_anothers_policy_are_left_out() -> None:
+    cold = [run(arm, "paper_nav-4", seed, 0.5) for arm in ("min_health", "central") for seed in range(4)]
+    warm = [run("min_health", "paper_nav-4", seed, 0.9, warm=True) for seed in range(4, 8)]
+    one = named(claims.judge_all(cold + warm), "min-health is above central")
+    assert (one.runs, one.found.p) == ((4, 4), 0.5)
+
+
+def test_tasks_that_contradict_each_other_are_seen_one_by_one() -> None:
+    """Better by much on two tasks and worse by much on two: pooled nothing, each by itself clear."""
+    rng, lead = np.random.default_rng(3), dict(zip(claims.STANDARD, (0.3, 0.3, -0.3, -0.3), strict=True))
+    runs = [
+        run(arm, task, seed, (lead[task] if arm == "min_health" else 0) + 0.02 * rng.normal())
+        for task in claims.STANDARD
+        for arm in ("min_health", "central")
+        for seed in range(6)
+    ]
+    one = named(claims.judge_all(runs), "min-health is above central", "standard")
+    assert one.found.p == 0.5
+    assert one.verdict not in ("holds", "does not hold")
+    assert [one.by_stratum[task].verdict for task in claims.STANDARD] == ["holds"] * 2 + ["does not hold"] * 2
+    # fully apart, 6 against 6: 2 / 924 = 0.0022; the smallest of four is multiplied by 4
+    corrected = [one.by_stratum[task].found.chance for task in claims.STANDARD]
+    assert min(corrected) == pytest.approx(4 * 2 / 924, abs=0.006)
+
+
+def test_many_equal_runs_show_no_difference() -> None:
+    """P lies within 0.5 +- 0.1 with a 90 % interval of 1.64 * sqrt(2 / (12 * 160)) = 0.053 either way."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=160)
+    assert claims.verdict(improvement([(values, np.roll(values, 1))], reps=2000)) == "no difference"
 
 
 def test_one_run_of_each_arm_on_six_tasks_is_a_sign_test() -> None:
@@ -146,17 +178,6 @@ def test_a_lead_that_grows_with_the_team() -> None:
     one = named(claims.judge_all(runs), "lead over central grows", "standard")
     assert one.strata == ("hazard_nav-4 to hazard_nav-8", "hazard_comm-10 to hazard_comm-16")
     assert (one.verdict, one.found.p) == ("holds", 1.0)
-
-
-def test_runs_that_differ_less() -> None:
-    rng = np.random.default_rng(4)
-    runs = [
-        run(arm, task, seed, 0.5 + width * rng.normal())
-        for task in claims.SUITES["standard"]
-        for arm, width in (("min_health", 0.01), ("central", 0.2))
-        for seed in range(5)
-    ]
-    assert named(claims.judge_all(runs), "differ less than central's", "standard").verdict == "holds"
 
 
 def test_learning_first_and_then_no_more() -> None:

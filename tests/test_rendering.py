@@ -141,11 +141,11 @@ def test_the_sky_is_painted_where_it_can_be_seen(task):
 # failures
 
 
-def test_a_broken_backend_is_told_with_the_line_that_mends_it(navigation, tmp_path):
+def test_a_backend_that_does_not_exist_is_told(navigation, tmp_path):
     _, rows = navigation
     with pytest.raises(RenderError, match="MUJOCO_GL: nonsense") as caught:
         film.record("hazard_nav-4", rows, tmp_path / "a.mp4", agent="random", backend="nonsense")
-    assert gl.MEND in str(caught.value)
+    assert gl.MEND not in str(caught.value), "nothing that could be installed is missing"
     assert list(tmp_path.iterdir()) == []
     assert gl.working_backend(("nonsense",)) is None
 

@@ -76,8 +76,8 @@ SMALL = ("--agent", "scripted_blind", "--tasks", "hazard_nav-4,coop_nav-3", "--e
 
 def test_killed_and_resumed_the_rows_are_the_same(tmp_path):
     seconds = run_whole(tmp_path / "whole", *SMALL, "--num-envs", "8")
-    (tmp_path / "parts/episodes").mkdir(parents=True)
-    (tmp_path / "parts/episodes/.hazard_nav-4-123.jsonl").write_text("half of a li")
+    (tmp_path / "parts/episodes" / f"{PARTIAL}123").mkdir(parents=True)
+    (tmp_path / "parts/episodes" / f"{PARTIAL}123" / "new.jsonl").write_text("half of a li")
     struck = run_killed(tmp_path / "parts", seconds, 3, *SMALL, "--num-envs", "8")
     assert struck >= 1
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")

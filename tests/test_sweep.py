@@ -146,7 +146,7 @@ def test_the_sweeps_that_come_along_are_what_the_comparison_needs(tmp_path: Path
         (SWEEP + SWEEP, "label"),
         (SWEEP.replace("central", "centrl"), "arm"),
         (SWEEP.replace("seeds", "seds"), r"run\.0\.seds"),
-        ("run = 3 =", "readable"),
+        ("run = 3 =", "not TOML"),
     ],
 )
 def test_a_wrong_sweep_is_refused(wrong: str, message: str, tmp_path: Path) -> None:

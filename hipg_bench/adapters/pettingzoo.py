@@ -101,6 +101,8 @@ class HipgParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
             UnknownNameError, ActionError: a stranger's action; one that is missing, malformed, not finite.
         """
         was = self._seen()
+        if not self.agents and not actions:
+            return {}, {}, {}, {}, {}  # as wrappers do that count rounds
         if not self.agents:
             raise HipgError(
                 f"{self.task_spec.task}: the episode is over: reset() comes before the next step()"

@@ -87,6 +87,7 @@ app.command()(doctor.doctor)
 
 def main() -> None:
     """Run the command line; mistakes are told in one line, with exit code 2, and interruptions with 130."""
+    _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that knows no UTF-8
@@ -102,6 +103,18 @@ def main() -> None:
         if ended.code == _INTERRUPTED:
             console.warn("hipg-bench: interrupted")
         raise
+
+
+def _open_what_is_closed() -> None:
+    """Where the shell closed a standard stream, let it lead nowhere: else a file of ours would become it."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115 (for as long as the program runs)
 
 
 _INTERRUPTED = 130

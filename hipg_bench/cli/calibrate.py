@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -29,9 +30,14 @@ def calibrate(
     """Measure a task's anchors, its hazard leverage, and what policies without eyes score."""
     from hipg_bench import registry
     from hipg_bench.evaluation import calibration
-    from hipg_bench.paths import data_folder
+    from hipg_bench.paths import data_folder, is_installed
 
     spec = registry.task_spec(task)
+    if write and is_installed():
+        raise SpecError(
+            f"--write changes {data_folder('tasks')}, which belongs to the installed package: work in a "
+            f"checkout, or copy the numbers of --json into a task file of your own"
+        )
     if split != "standard":
         _calibrate_split(spec, split, episodes, threads, write, as_json)
         return

@@ -72,7 +72,10 @@ def check(
 def pack(
     folder: Folder,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The zip; by default <name>.zip here.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="The zip; by default <name>.zip here, or beside the folder if you are in it."
+        ),
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -86,7 +89,9 @@ def pack(
     if any(finding.severity == "error" for finding in findings):
         console.say("\nnot packed")
         raise typer.Exit(1)
-    target = out or Path(f"{folder.resolve().name}.zip")
+    inside = Path.cwd().resolve().is_relative_to(folder.resolve())
+    place = folder.resolve().parent if inside else Path()  # never into the folder that is packed
+    target = out or place / f"{folder.resolve().name}.zip"
     digest = write(folder, target)
     console.say(f"{target}: {target.stat().st_size} bytes, sha256 {digest}")
 

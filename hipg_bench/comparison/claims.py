@@ -1,17 +1,24 @@
 """The paper's claims, each as a comparison of two samples of runs, and the rule by which it is judged.
 
-A claim says that values x are above values y: final scores of two arms, their deviations from the median,
-gains over a part of the training. It **holds** if the 95 % interval of P(improvement) lies above 1/2 and the
-permutation test is below 0.05; it **does not hold** if the interval lies below 1/2 and the test is below
-0.05; else it is **undecided**. Tasks where one side has no run are left out; where runs are compared by how
-far they are apart, those where one side has fewer than three. There is no correction for the number of
-claims: about one in twenty would pass by luck.
+A claim says that values x are above values y: final scores of two arms, gains over a part of the training.
+It **holds** if the 95 % interval of P(improvement) lies above 1/2 and the permutation test is below 0.05; it
+**does not hold** if the interval lies below 1/2 and the test is below 0.05. There is **no difference** if the
+90 % interval lies within 1/2 +- 0.1, which is the equivalence test of two one-sided tests at 0.05; else it is
+**undecided**. Tasks where one side has no run are left out, and so are runs that began with another run's
+policy. There is no correction for the number of claims: about one in twenty would pass by luck.
+
+Pooling over tasks hides an arm that is better on one and worse on another, so each task has a verdict of its
+own, by the same rule, with Holm's correction (1979) for the number of tasks in the claim.
+
+How far an arm's runs lie apart is not compared: for five runs a side the usual tests find a twofold spread in
+a fifth of all cases, and the median's own run, whose distance is 0 for odd numbers, must be left out (Hines
+and Hines 2000).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -20,13 +27,12 @@ from jaxtyping import Float
 from hipg_bench.comparison.improvement import Improvement, Stratum, improvement
 from hipg_bench.comparison.traces import Trace
 
-Verdict = Literal["holds", "does not hold", "undecided", "too few runs"]
+Verdict = Literal["holds", "does not hold", "no difference", "undecided", "too few runs"]
 Runs = Sequence[Trace]
 Values = Float[np.ndarray, "_"]
 
-_FEWEST_APART = 3
-"""Runs of which distances from the median can differ: those of two are equal."""
-_LEVEL = 0.05
+_LEVEL, _ALIKE = 0.05, 0.1
+"""Of the tests; how far from 1/2 a P(improvement) may lie that makes no difference."""
 _EARLY, _HALF, _END = 0.2, (0.4, 0.6), 0.8
 """Shares of a run: its beginning ends, its middle, its end begins."""
 
@@ -46,6 +52,19 @@ TASKS = tuple(task for suite in SUITES for task in (*SUITES[suite], *_HARMLESS[s
 
 
 @dataclasses.dataclass(frozen=True)
+class Single:
+    """What became of a claim on one task.
+
+    Attributes:
+        found: with the permutation test's p-value as Holm corrects it.
+        verdict: by the rule above.
+    """
+
+    found: Improvement
+    verdict: Verdict
+
+
+@dataclasses.dataclass(frozen=True)
 class Judged:
     """A claim and what became of it.
 
@@ -57,6 +76,7 @@ class Judged:
         runs: values of x and of y in all strata.
         found: None where there are too few runs.
         verdict: by the rule above.
+        by_stratum: the same for each task by itself.
     """
 
     claim: str
@@ -66,11 +86,13 @@ class Judged:
     runs: tuple[int, int]
     found: Improvement | None
     verdict: Verdict
+    by_stratum: Mapping[str, Single]
 
 
 def judge_all(runs: Runs) -> list[Judged]:
     """All claims on both suites."""
-    return [one for suite in SUITES for one in _judge_suite(suite, runs)]
+    fresh = [run for run in runs if not run.warm]
+    return [one for suite in SUITES for one in _judge_suite(suite, fresh)]
 
 
 def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
@@ -86,7 +108,6 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
         ("central is above local", arms("central", "local", finals, hazard)),
         ("local is above MADDPG", arms("local", "maddpg", finals, hazard)),
         ("min-health's lead over central grows with the team", _growth(runs, _GROWING[suite])),
-        ("min-health's runs differ less than central's", arms("central", "min_health", spreads, hazard)),
         (
             "local learns first: above central in the first fifth",
             arms("local", "central", early, hazard),
@@ -94,7 +115,6 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
         ("local plateaus: central gains more after half-time", arms("central", "local", late_gains, hazard)),
         ("QMIX fails: local is above it", arms("local", "qmix", finals, hazard)),
         ("without hazard: central is above min-health", arms("central", "min_health", finals, harmless)),
-        ("without hazard: min-health's runs differ more", arms("min_health", "central", spreads, harmless)),
     ]
     return [_judged(claim, suite, strata) for claim, strata in compared]
 
@@ -102,14 +122,6 @@ def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
 def finals(runs: Runs) -> Values:
     """What each run reached."""
     return np.array([run.final for run in runs])
-
-
-def spreads(runs: Runs) -> Values:
-    """How far each run ended from the median run (Brown and Forsythe 1974); nothing of fewer than three."""
-    if len(runs) < _FEWEST_APART:
-        return np.empty(0)
-    reached = finals(runs)
-    return np.abs(reached - np.median(reached))
 
 
 def early(runs: Runs) -> Values:
@@ -125,9 +137,10 @@ def late_gains(runs: Runs) -> Values:
 def verdict(found: Improvement) -> Verdict:
     """By the rule that this file begins with."""
     low, high = found.ci95
-    if found.chance >= _LEVEL or low <= 0.5 <= high:
-        return "undecided"
-    return "holds" if low > 0.5 else "does not hold"
+    if found.chance < _LEVEL and not low <= 0.5 <= high:
+        return "holds" if low > 0.5 else "does not hold"
+    low, high = found.ci90
+    return "no difference" if low > 0.5 - _ALIKE and high < 0.5 + _ALIKE else "undecided"
 
 
 def _growth(runs: Runs, pairs: Sequence[tuple[str, str]]) -> dict[str, Stratum]:
@@ -147,9 +160,21 @@ def _judged(claim: str, suite: str, strata: dict[str, Stratum]) -> Judged:
     missing = tuple(name for name in strata if name not in enough)
     counts = (sum(len(x) for x, _ in enough.values()), sum(len(y) for _, y in enough.values()))
     if not enough:
-        return Judged(claim, suite, (), missing, counts, None, "too few runs")
+        return Judged(claim, suite, (), missing, counts, None, "too few runs", {})
     found = improvement(list(enough.values()))
-    return Judged(claim, suite, tuple(enough), missing, counts, found, verdict(found))
+    singles = _singles(enough)
+    return Judged(claim, suite, tuple(enough), missing, counts, found, verdict(found), singles)
+
+
+def _singles(strata: Mapping[str, Stratum]) -> dict[str, Single]:
+    """Each task by itself; the k-th smallest of n p-values times n - k + 1, never falling (Holm)."""
+    found = {name: improvement([pair]) for name, pair in strata.items()}
+    least, singles = 0.0, dict[str, Single]()
+    for rank, name in enumerate(sorted(found, key=lambda name: found[name].chance)):
+        least = max(least, min(1.0, found[name].chance * (len(found) - rank)))
+        corrected = dataclasses.replace(found[name], chance=least)
+        singles[name] = Single(corrected, verdict(corrected))
+    return {name: singles[name] for name in strata}
 
 
 def _of(runs: Runs, arm: str, task: str) -> Runs:

@@ -29,13 +29,14 @@ class Improvement:
 
     Attributes:
         p: P(improvement).
-        ci95: its stratified bootstrap interval.
+        ci95, ci90: its stratified bootstrap intervals.
         chance: two-sided p-value of the permutation test: how often labels drawn at random within every
             stratum bring P as far from 1/2.
     """
 
     p: float
     ci95: tuple[float, float]
+    ci90: tuple[float, float]
     chance: float
 
 
@@ -48,8 +49,8 @@ def improvement(strata: Sequence[Stratum], *, reps: int = _REPS, seed: int = 1) 
     shuffled = statistics.improvement([x for x, _ in dealt], [y for _, y in dealt])
     # the data themselves are one of the ways in which labels may fall
     as_far = np.abs(shuffled - 0.5) >= abs(p - 0.5) - 1e-12
-    interval = statistics.improvement_ci95(ours, theirs, reps=reps, seed=seed)
-    return Improvement(p, interval, float((1 + as_far.sum()) / (1 + reps)))
+    ci95, ci90 = statistics.improvement_intervals(ours, theirs, (0.95, 0.9), reps=reps, seed=seed)
+    return Improvement(p, ci95, ci90, float((1 + as_far.sum()) / (1 + reps)))
 
 
 def _dealt(x: Values, y: Values, reps: int, chance: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

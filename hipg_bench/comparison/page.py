@@ -33,7 +33,15 @@ def results(judged: Sequence[Judged], runs: Sequence[Trace], figures: Sequence[s
         runs: of which.
         figures: links to the drawn files.
     """
-    parts = ["## Verdicts", verdict_table(judged), "## Final scores", score_table(runs), "## Curves"]
+    parts = [
+        "## Verdicts",
+        verdict_table(judged),
+        "### Task by task",
+        task_table(judged),
+        "## Final scores",
+        score_table(runs),
+        "## Curves",
+    ]
     for family in FAMILIES:
         drawn = [link for link in figures if Path(link).stem in (family, f"{family}_iqm")]
         if drawn:
@@ -57,6 +65,17 @@ def verdict_table(judged: Sequence[Judged]) -> str:
             numbers = [f"{one.found.p:.2f}", f"{low:.2f} to {high:.2f}", f"{one.found.chance:.3f}"]
         cells = [one.claim, one.suite, where, f"{one.runs[0]} / {one.runs[1]}", *numbers, one.verdict]
         lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def task_table(judged: Sequence[Judged]) -> str:
+    """One row per claim and task that has runs of both sides; p-values corrected within a claim (Holm)."""
+    lines = ["| claim | task | P(improvement) | 95 % interval | corrected p | verdict |", "|---" * 6 + "|"]
+    for one in judged:
+        for name, single in one.by_stratum.items():
+            low, high = single.found.ci95
+            numbers = [f"{single.found.p:.2f}", f"{low:.2f} to {high:.2f}", f"{single.found.chance:.3f}"]
+            lines.append("| " + " | ".join([one.claim, name, *numbers, single.verdict]) + " |")
     return "\n".join(lines)
 
 
@@ -96,6 +115,15 @@ def facts(judged: Sequence[Judged]) -> list[dict[str, object]]:
             "ci95": None if one.found is None else list(one.found.ci95),
             "permutation_p": None if one.found is None else one.found.chance,
             "verdict": one.verdict,
+            "by_task": {
+                name: {
+                    "p_improvement": single.found.p,
+                    "ci95": list(single.found.ci95),
+                    "corrected_p": single.found.chance,
+                    "verdict": single.verdict,
+                }
+                for name, single in one.by_stratum.items()
+            },
         }
         for one in judged
     ]

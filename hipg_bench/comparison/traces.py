@@ -32,6 +32,7 @@ class Trace:
         steps: (K,) environment steps, rising.
         score: (K,) there, 0 as random actions and 1 as the reference.
         tried: scores are of trials without exploration; else of the training's own episodes.
+        warm: it began with another run's policy.
         final: score of the last policy by the standard protocol; else the mean of the last tenth.
     """
 
@@ -41,6 +42,7 @@ class Trace:
     steps: Float[np.ndarray, "K"]
     score: Float[np.ndarray, "K"]
     tried: bool
+    warm: bool
     final: float
 
     def between(self, start: float, end: float) -> float:
@@ -115,6 +117,6 @@ def _read(path: Path, arm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Tr
     score = np.array([spec.score(value) for value in returns])
     final = record.get("result", {}).get("return")
     last = score[steps > (1 - _END) * steps[-1]].mean()
-    return Trace(
-        arm, spec.task, seed, steps, score, tried, float(last if final is None else spec.score(final))
-    )
+    warm = bool(record.get("settings", {}).get("start"))
+    reached = float(last if final is None else spec.score(final))
+    return Trace(arm, spec.task, seed, steps, score, tried, warm, reached)

@@ -124,6 +124,13 @@ def improvement(ours: Drawn, theirs: Drawn) -> Float[np.ndarray, "..."]:
 
 def improvement_ci95(ours: Scores, theirs: Scores, *, reps: int = _REPS, seed: int = 1) -> Interval:
     """Interval of `improvement`: both sides' runs are redrawn, within each task."""
+    return improvement_intervals(ours, theirs, (0.95,), reps=reps, seed=seed)[0]
+
+
+def improvement_intervals(
+    ours: Scores, theirs: Scores, levels: Sequence[float], *, reps: int = _REPS, seed: int = 1
+) -> list[Interval]:
+    """The same at several levels, such as 0.95 and 0.9."""
     chance = np.random.default_rng(seed)
     pairs = sum(len(a) * len(b) for a, b in zip(ours, theirs, strict=True))
     values = [
@@ -132,7 +139,8 @@ def improvement_ci95(ours: Scores, theirs: Scores, *, reps: int = _REPS, seed: i
         )
         for size in _chunks(reps, pairs)
     ]
-    return _ends(np.concatenate(values))
+    drawn = np.concatenate(values)
+    return [_ends(drawn, level) for level in levels]
 
 
 def paired_difference(
@@ -203,6 +211,6 @@ def _episode_means(run: Float[np.ndarray, "_"], times: int, chance: np.random.Ge
     )
 
 
-def _ends(means: Float[np.ndarray, "reps"]) -> Interval:
-    low, high = np.percentile(means, [2.5, 97.5])
+def _ends(means: Float[np.ndarray, "reps"], level: float = 0.95) -> Interval:
+    low, high = np.percentile(means, [50 * (1 - level), 50 * (1 + level)])
     return float(low), float(high)

@@ -21,7 +21,7 @@ from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.leaderboard import films
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Entry, now
-from hipg_bench.leaderboard.playing import Match, Progress, keep, play, played_tasks, quiet
+from hipg_bench.leaderboard.playing import Match, Progress, keep, limited, play, played_tasks, quiet
 from hipg_bench.leaderboard.rows import MOST_BYTES
 from hipg_bench.leaderboard.shown import rows_path, run_path
 from hipg_bench.leaderboard.source import BUNDLE, Source
@@ -74,7 +74,7 @@ def add(
         SpecError: the claimed rows are refused.
         ResumeError: the claimed rows are of another agent, suite or version.
     """
-    agent = source.agent
+    agent, progress = source.agent, limited(progress)
     if source.bundle is not None:
         _refuse_faulty(agent)
     earlier = board.entry(agent.name) if replace and agent.name in board.names() else None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 from hipg_bench import registry
+from hipg_bench.errors import BoardError
 from hipg_bench.evaluation import runner, splits
 from hipg_bench.evaluation.episodes import Plan, Row
 from hipg_bench.evaluation.results import aggregate
@@ -31,6 +33,28 @@ Progress = Callable[[str, float, float], None]
 
 def quiet(stage: str, done: float, total: float) -> None:
     """Tell nobody."""
+
+
+MOST_HOURS = 48.0
+"""Wall-clock time that an entry may play in one `add` or `verify`, h."""
+
+
+def limited(progress: Progress, hours: float = MOST_HOURS) -> Progress:
+    """The same, but it ends what it is told of after so many hours from now.
+
+    Every step of an agent has a limit of its own; together those of a whole suite would take weeks.
+
+    Raises:
+        BoardError: when it is told of anything after that.
+    """
+    deadline = time.monotonic() + 3600 * hours
+
+    def tell(stage: str, done: float, total: float) -> None:
+        if time.monotonic() > deadline:
+            raise BoardError(f"{stage}: the entry has played for {hours:g} hours in all, which is the limit")
+        progress(stage, done, total)
+
+    return tell
 
 
 @dataclasses.dataclass(frozen=True)

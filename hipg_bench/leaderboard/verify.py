@@ -18,7 +18,7 @@ from hipg_bench.evaluation.episodes import versions
 from hipg_bench.evaluation.seeds import SUITE, commitment
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
-from hipg_bench.leaderboard.playing import Match, Progress, keep_hidden, play, quiet
+from hipg_bench.leaderboard.playing import Match, Progress, keep_hidden, limited, play, quiet
 from hipg_bench.leaderboard.rows import compare, unpack
 from hipg_bench.leaderboard.salt import read_commitments
 from hipg_bench.leaderboard.shown import Shown, read_shown, rows_path
@@ -64,7 +64,7 @@ def verify(
             the salt not the promised one, or the entry is damaged or changed meanwhile.
         UnknownNameError: no such entry.
     """
-    folder = board.folder(name)
+    folder, progress = board.folder(name), limited(progress)
     changed = protocol.differences()
     if changed:
         raise BoardError(f"the tree is not {SUITE}, so nothing is verified with it: {changed[0]}")

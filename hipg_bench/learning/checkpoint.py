@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,6 +11,12 @@ import torch
 
 from hipg_bench.errors import ResumeError
 from hipg_bench.paths import check_seal, replacing
+
+_UNREADABLE = (
+    OSError, EOFError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError,
+    AssertionError, struct.error, pickle.UnpicklingError,
+)  # fmt: skip
+"""What PyTorch raises of files that are none of its."""
 
 
 def save(path: Path, content: dict[str, Any]) -> None:
@@ -27,7 +34,7 @@ def load(path: Path) -> dict[str, Any]:
     check_seal(path)
     try:
         content = torch.load(path, weights_only=True)
-    except (EOFError, RuntimeError, ValueError, KeyError, pickle.UnpicklingError) as error:
+    except _UNREADABLE as error:
         raise ResumeError(f"{path} is damaged, or is no checkpoint: {_first_line(error)}") from error
     if not isinstance(content, dict) or "settings" not in content or "iteration" not in content:
         raise ResumeError(f"{path} is no checkpoint of a training run")

@@ -53,7 +53,13 @@ def save_network(tensors: Mapping[str, np.ndarray], path: Path, form: Form = _ML
             `attention.Attention`.
         path: where.
         form: the network's; its type says which kind it is.
+
+    Raises:
+        BundleError: weights that are not finite, or larger than a policy file may hold.
     """
+    for name, tensor in tensors.items():
+        if not (np.abs(tensor) <= _LARGEST).all():
+            raise BundleError(f"{path}: {name} must be finite and within +-{_LARGEST:g}: {_worst(tensor)}")
     plain = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
     with replacing(path) as temporary:
         save_file(plain, temporary, {"format": f"{form.format} {form.model_dump_json()}"})

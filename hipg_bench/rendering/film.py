@@ -24,11 +24,12 @@ from jaxtyping import Float
 
 from hipg_bench import processes
 from hipg_bench.errors import HipgError, RenderError
-from hipg_bench.paths import replacing
+from hipg_bench.paths import PARTIAL, replacing
 from hipg_bench.registry import task_spec
 from hipg_bench.rendering import gl
 from hipg_bench.spec import Params, TaskSpec
 
+_WIDEST, _FASTEST = 7680, 240
 FORMATS = (".mp4", ".gif")
 """By the ending of a film's name: H.264, or an animated picture."""
 
@@ -110,8 +111,11 @@ def record(
     out = Path(out)
     if out.suffix.lower() not in FORMATS:
         raise RenderError(f"films end in {' or '.join(FORMATS)}, got {out.name!r}")
-    if min(size) < 64 or size[0] % 2 or size[1] % 2 or fps < 1:
-        raise RenderError(f"even sizes of at least 64 pixels and fps >= 1 are allowed, got {size} and {fps}")
+    if min(size) < 64 or max(size) > _WIDEST or size[0] % 2 or size[1] % 2 or not 1 <= fps <= _FASTEST:
+        raise RenderError(
+            f"even sizes of 64 to {_WIDEST} pixels and 1 to {_FASTEST} frames per second are allowed, "
+            f"got {size} and {fps}"
+        )
     chosen = backend or gl.working_backend()
     if chosen is None:
         raise RenderError(f"no OpenGL works here, neither {' nor '.join(gl.BACKENDS)}: run\n  {gl.MEND}")
@@ -270,7 +274,10 @@ def _film(folder: Path, parent: int) -> None:
     with contextlib.closing(encoder):
         for count, (frame, total) in enumerate(_frames(job, rows), start=1):
             if os.getppid() != parent:
-                Path(job.out).unlink(missing_ok=True)
+                half = Path(job.out)
+                half.unlink(missing_ok=True)
+                if half.parent.name.startswith(PARTIAL):
+                    half.parent.rmdir()
                 return
             encoder.send(frame)
             sys.stdout.write(f"{count} {total}\n")

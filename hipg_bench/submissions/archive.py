@@ -31,6 +31,7 @@ MOST_BYTES, MOST_BYTES_PER_FILE = 512_000_000, 100_000_000
 """Unpacked."""
 ENDINGS = (".toml", ".md", ".txt", ".json", ".csv", ".safetensors", ".onnx", ".py", ".npy", ".npz")
 """Kinds of files that may be in a bundle; pickles (.pt, .pth, .pkl, .zip of others) may not."""
+_ADVICE = "\n(make archives with `hipg-bench submit pack FOLDER`; those of other programs are refused)"
 _MOST_DIRECTORY = 400_000
 _MOST_MANIFEST = 400_000
 _MOST_RATIO = 100
@@ -126,9 +127,9 @@ def unpack(archive: Path, folder: Path) -> None:
             with zipfile.ZipFile(archive) as reader:
                 _unpack(reader, whole)
         except (BundleError, SpecError, zipfile.BadZipFile, NotImplementedError, zlib.error) as error:
-            raise BundleError(f"{archive}: {error}") from error
+            raise BundleError(f"{archive}: {error}{_ADVICE}") from error
         except (EOFError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-            raise BundleError(f"{archive}: cannot be read: {error}") from error
+            raise BundleError(f"{archive}: cannot be read: {error}{_ADVICE}") from error
         whole.rename(folder)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -15,6 +16,11 @@ from hipg_bench.submissions.paperwork import SUITE_TAG, TODO
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]{0,63}")
+
+
+def _toml(text: str) -> str:
+    """A TOML string: JSON's, but for characters beyond the basic plane, which stand as they are, and DEL."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def init(folder: Path, tier: int, *, authors: str = "", license: str = "", summary: str = "") -> list[Path]:
@@ -48,6 +54,7 @@ def init(folder: Path, tier: int, *, authors: str = "", license: str = "", summa
         "authors": authors or TODO, "license": license or TODO, "summary": summary or f"{TODO}: one sentence",
     }  # fmt: skip
     engine = jinja2.Environment(loader=jinja2.FileSystemLoader(_TEMPLATES), undefined=jinja2.StrictUndefined)
+    engine.filters["toml"] = _toml
     names = ["agent.toml", "README.md", *(["agent.py"] if tier == 2 else [])]
     for file in names:
         write_text(folder / file, engine.get_template(f"{file}.j2").render(values) + "\n")

@@ -89,7 +89,7 @@ def test_a_wrong_shape_is_refused_with_the_right_one():
     env = HipgVecEnv("hazard_nav-4", 2)
     env.reset()
     with pytest.raises(
-        ActionError, match=r"hazard_nav-4: actions of shape \(8, 3\) \(B \* N, A\) are allowed"
+        ActionError, match=r"hazard_nav-4: numbers of shape \(8, 3\) are allowed \(B \* N, A\)"
     ):
         env.step(np.zeros((2, 12)))
 
