@@ -1,7 +1,7 @@
 """Named blocks of the flat vectors that agents and critics see.
 
-A layout is the only description of an observation: the code packs by it, the tables of
-``hipg-bench tasks show`` are printed from it, and learners find the health columns through it.
+A layout names the numbers of an observation: drones are packed by it, the tables of ``hipg-bench tasks show``
+are printed from it, spaces take their limits from it, and learners find the health columns through it.
 """
 
 from __future__ import annotations

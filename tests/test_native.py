@@ -117,3 +117,30 @@ def test_so_many_worlds_that_threads_share_them_go_on_as_alone(task):
         step, alone = many.step(np.repeat(push[None], 300, axis=0)), one.step(push[None])
         assert step.observation[299].tobytes() == alone.observation[0].tobytes()
         assert step.reward[299] == alone.reward[0]
+
+
+@pytest.mark.parametrize("damage", [b"", b"junk", None])
+def test_damaged_machine_code_is_made_anew(tmp_path, damage):
+    """What Numba keeps on disk is cut, replaced or emptied: the numbers are the same, and it heals."""
+    code = (
+        "import numpy as np, hipg_bench\nenv = hipg_bench.make('paper_nav-4', 2, threads=1)\n"
+        "step = env.reset()\n"
+        "for _ in range(3): step = env.step(np.full((2, 4, 2), 0.3))\n"
+        "print(step.observation.sum(dtype=float), step.reward.sum())"
+    )
+
+    def run():
+        done = subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    first = run()
+    kept = [path for path in tmp_path.rglob("*") if path.suffix in (".nbi", ".nbc")]
+    assert kept
+    for path in kept:
+        path.write_bytes(path.read_bytes()[:100] if damage is None else damage)
+    assert run() == first
+    assert run() == first

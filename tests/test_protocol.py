@@ -3,13 +3,17 @@
 import hashlib
 import hmac
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import hipg_bench
 from hipg_bench import task_spec
 from hipg_bench.errors import HipgError, ResumeError
-from hipg_bench.evaluation import protocol, runner, seeds
+from hipg_bench.evaluation import machines, protocol, runner, seeds, sources
 from hipg_bench.evaluation.episodes import Plan
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.simple import Random, Zero
@@ -56,6 +60,48 @@ def test_what_decides_an_episode_is_in_the_file():
     assert {"assets/walker.xml", "tasks/splits/shift.toml", "tasks/splits/walker.safetensors"} <= set(files)
     path = protocol.data_folder("assets") / "drone.xml"
     assert files["assets/drone.xml"] == hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def test_what_is_loaded_to_play_is_frozen(tmp_path):
+    """The files that Python itself loads while agents of all kinds play, against what is found by reading."""
+    code = (
+        "import sys\nfrom pathlib import Path\n"
+        "from hipg_bench import task_spec\nfrom hipg_bench.evaluation import runner\n"
+        "from hipg_bench.evaluation.episodes import Plan\nfrom hipg_bench.evaluation import results\n"
+        "from hipg_bench.policies.network import load_network\nfrom hipg_bench.paths import data_folder\n"
+        "for task in ('hazard_nav-4', 'multiwalker-3', 'paper_comm-10'):\n"
+        "    path = data_folder('agents') / 'mappo_minhealth' / task / 'seed0.safetensors'\n"
+        "    for split in ('standard', 'ad_hoc') if task[0] != 'p' else ('standard',):\n"
+        "        spec = task_spec(task).override(horizon=3)\n"
+        "        rows = Plan(episodes=1, threads=1, split=split).play_all(spec, load_network(path))\n"
+        "print(*sorted(str(m.__file__) for n, m in sys.modules.items() if n.startswith('hipg_bench')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
+    )
+    package = Path(hipg_bench.__file__).parent
+    loaded = {Path(name).relative_to(package) for name in done.stdout.split()}
+    frozen = set(sources.files())
+    assert Path("policies/attention.py") in frozen
+    # the runner is loaded by this test alone: what it adds decides no row
+    assert {
+        str(path) for path in loaded - frozen if path.parts[0] in ("families", "mechanics", "policies")
+    } <= {f"policies/{name}.py" for name in ("__init__", "bundle", "card", "foreign", "graph", "simple")}
+    assert {Path("env.py"), Path("sim.py"), Path("native.py"), Path("layout.py")} <= loaded & frozen
+
+
+def test_where_rows_are_equal(tmp_path, monkeypatch):
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text("processor : 0\nflags : fpu sse2 avx fma avx2\n")
+    monkeypatch.setattr(machines.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(machines.platform, "libc_ver", lambda: ("glibc", "2.36"))
+    assert machines.why_rows_may_differ(cpuinfo) is None
+    cpuinfo.write_text("processor : 0\nflags : fpu sse2 avx\n")
+    assert "no FMA instructions" in machines.why_rows_may_differ(cpuinfo)
+    monkeypatch.setattr(machines.platform, "libc_ver", lambda: ("", ""))
+    assert "C library" in machines.why_rows_may_differ(cpuinfo)
+    monkeypatch.setattr(machines.platform, "machine", lambda: "aarch64")
+    assert "aarch64" in machines.why_rows_may_differ(cpuinfo)
 
 
 def test_hidden_seeds_are_an_hmac():

@@ -1,6 +1,7 @@
 """`submit init`, `check` and `pack`: what is wrong with a folder is found, and said with a remedy."""
 
 import json
+import re
 import zipfile
 
 import numpy as np
@@ -15,6 +16,7 @@ from hipg_bench import make, task_spec
 from hipg_bench.cli import app
 from hipg_bench.errors import BundleError
 from hipg_bench.policies.bundle import load_agent
+from hipg_bench.policies.card import read_card
 from hipg_bench.policies.export import export_sequential
 from hipg_bench.submissions.archive import unpack
 from hipg_bench.submissions.check import check
@@ -257,7 +259,8 @@ def test_an_agent_that_is_too_slow_is_told_how_slow(tmp_path):
     folder = coded(tmp_path / "mine", f"time.sleep(0.13 * len(alive)) or {ZEROS}")
     found = list(try_task(load_agent(folder), task_spec("coop_nav-3").override(horizon=3), 0))
     (slow,) = [finding for finding in found if finding.severity == "error"]
-    assert "a step takes 13" in slow.what
+    # 130 ms and what a busy machine adds
+    assert re.search(r"a step takes (1[3-9]|[2-9]\d)\d\.\d ms", slow.what)
     assert "of 100 ms" in slow.what
     assert "smaller network" in slow.remedy
 
@@ -279,3 +282,45 @@ def test_init_refuses(tmp_path, name, tier, reason):
     (tmp_path / "there").mkdir()
     with pytest.raises(BundleError, match=reason):
         init(tmp_path / name, tier)
+
+
+def test_any_author_can_be_named(tmp_path):
+    """JSON would escape what lies beyond the basic plane in a way that TOML does not know."""
+    authors = 'Ada "L" \\ 😀 \x7f Ünal 中文'
+    init(tmp_path / "agent_a", 0, authors=authors, license="MIT", summary="s")
+    assert read_card(tmp_path / "agent_a" / "agent.toml").authors == authors
+
+
+def test_a_byte_order_mark_gets_advice(tmp_path):
+    init(tmp_path / "agent_a", 0)
+    card = tmp_path / "agent_a" / "agent.toml"
+    card.write_bytes(b"\xef\xbb\xbf" + card.read_bytes())
+    with pytest.raises(BundleError, match="byte-order mark: save it as UTF-8 without one"):
+        read_card(card)
+
+
+def test_a_folder_packed_from_within_does_not_hold_its_archive(tmp_path, monkeypatch):
+    folder = filled(tmp_path / "newcomer")
+    write_weights(folder / TASK / "seed0.safetensors")
+    monkeypatch.chdir(folder)
+    for _ in range(2):
+        done = CliRunner().invoke(app, ["submit", "pack", "."])
+        assert done.exit_code == 0, done.output
+    assert (tmp_path / "newcomer.zip").is_file()
+    assert not list(folder.glob("*.zip"))
+
+
+def test_an_archive_of_another_program_is_refused_with_advice(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as made:
+        made.writestr("newcomer/agent.toml", "x")
+    with pytest.raises(BundleError, match="hipg-bench submit pack FOLDER"):
+        unpack(tmp_path / "a.zip", tmp_path / "out")
+
+
+def test_weights_that_are_no_numbers_are_not_written(tmp_path):
+    layer = torch.nn.Linear(4, 2)
+    with torch.no_grad():
+        layer.weight[0, 0] = float("nan")
+    with pytest.raises(BundleError, match="must be finite"):
+        export_sequential(torch.nn.Sequential(layer), tmp_path / "a.safetensors")
+    assert not list(tmp_path.iterdir())

@@ -14,7 +14,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from hipg_bench.errors import BoardError, BundleError, ResumeError, SpecError
-from hipg_bench.evaluation import protocol, runner
+from hipg_bench.evaluation import machines, protocol, runner
 from hipg_bench.leaderboard import adding
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.playing import Match
@@ -87,6 +87,12 @@ def test_a_tree_that_is_not_the_frozen_suite_verifies_nothing(board, salted, tmp
     with pytest.raises(BoardError, match=r"the tree is not hipg-1.*floor was -1, is -2"):
         verify(board, "newcomer", salted[1], tmp_path / "private", threads=1)
     assert board.entry("newcomer").verification is None
+
+
+def test_where_last_bits_differ_nothing_is_verified(board, salted, tmp_path, monkeypatch):
+    monkeypatch.setattr(machines, "why_rows_may_differ", lambda: "this processor has no FMA instructions")
+    with pytest.raises(BoardError, match="nothing is verified here: this processor has no FMA"):
+        verify(board, "newcomer", salted[1], tmp_path / "private", threads=1)
 
 
 @pytest.fixture(scope="module")

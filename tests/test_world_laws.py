@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 import mujoco
@@ -147,7 +148,7 @@ def test_a_reset_leaves_what_the_engines_own_reset_leaves(env: BatchEnv):
 def test_divergence_ends_only_its_own_episode(
     env: BatchEnv, value: float, tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.chdir(str(tmp_path))  # MuJoCo writes its warnings to a file in the working directory
+    monkeypatch.chdir(str(tmp_path))
     calm, broken = env.reset(np.arange(4)), make(env.spec, 4, threads=2)
     disturbed = broken.reset(np.arange(4))
     for t in range(34):
@@ -181,6 +182,7 @@ def test_divergence_ends_only_its_own_episode(
             ):
                 assert same(flat(calm)[name][b], flat(disturbed)[name][b]), (t, name)
     assert (disturbed.info["end_reason"] != "physics").all()
+    assert not os.listdir(), "MuJoCo would write its warnings to a file in the working folder"
 
 
 def test_every_element_has_a_name(visual: mujoco.MjModel):

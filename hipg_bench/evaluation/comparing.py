@@ -104,7 +104,13 @@ def differences(ours: Path, theirs: Path) -> Mapping[str, tuple[float, Interval]
         if name in played and task["score"] is not None:
             if task["fingerprint"] != played[name]["fingerprint"]:
                 raise HipgError(f"{ours} and {theirs} are of other versions of {name}")
-            found[name] = paired_difference(_scores(ours, name), _scores(theirs, name))
+            sides = _scores(ours, name), _scores(theirs, name)
+            if sides[0].shape[1] != sides[1].shape[1]:
+                raise HipgError(
+                    f"{name}: {ours} has rows of {sides[0].shape[1]} worlds and {theirs} of "
+                    f"{sides[1].shape[1]}: finish the shorter evaluation"
+                )
+            found[name] = paired_difference(*sides)
     return found
 
 

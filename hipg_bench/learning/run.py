@@ -118,6 +118,7 @@ def train(
 def _train_alone(
     settings: AnySettings, out: Path, command: str, report: Callable[[int, Log], None] | None
 ) -> None:
+    _check_not_lost(out)
     if not (out / _RECORD).exists():
         write_text(out / _RECORD, _record(settings, command, 0, 0.0))
     learner = new_learner(settings, out)
@@ -153,6 +154,19 @@ def _train_alone(
             learner.save(checkpoint)
     if not isinstance(learner, mappo.Trainer):
         shutil.rmtree(out / _REPLAY, ignore_errors=True)
+
+
+def _check_not_lost(out: Path) -> None:
+    """Refuse to begin anew over a run whose checkpoint is gone; a kill loses the first one at most.
+
+    Raises:
+        ResumeError: there is such a run.
+    """
+    curve = out / "curve.csv"
+    if not (out / "checkpoint.pt").exists() and curve.exists() and len(curve.read_text().splitlines()) > 2:
+        raise ResumeError(
+            f"{out} holds a run without its checkpoint.pt: it cannot go on; choose another --out"
+        )
 
 
 def _read_curve(path: Path, iterations: int) -> list[dict[str, Any]]:

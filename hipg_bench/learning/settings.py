@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 
 from hipg_bench.errors import ResumeError, SpecError, hint
 from hipg_bench.registry import task_spec
 from hipg_bench.spec import Params, parse
+
+Widths = Annotated[
+    tuple[Annotated[int, pydantic.Field(ge=1, le=8192)], ...], pydantic.Field(min_length=1, max_length=32)
+]
+"""Of hidden layers."""
 
 
 class RunSettings(Params):
@@ -130,8 +135,8 @@ class Settings(RunSettings):
     target_kl: float | None = pydantic.Field(default=0.015, gt=0, le=1)
     max_grad_norm: float = pydantic.Field(default=1.0, gt=0)
     std: float = pydantic.Field(default=0.6, gt=0, le=5)
-    actor_hidden: tuple[int, ...] = (128, 128)
-    critic_hidden: tuple[int, ...] = (256, 256)
+    actor_hidden: Widths = (128, 128)
+    critic_hidden: Widths = (256, 256)
     attends: tuple[str, ...] = ()
     mask_dead: bool = True
     zero_dead_actions: bool = False
@@ -171,7 +176,7 @@ class ReplaySettings(RunSettings):
     rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     max_grad_norm: float = pydantic.Field(default=5.0, gt=0)
     target_share: float = pydantic.Field(default=0.02, gt=0, le=1)
-    hidden: tuple[int, ...] = pydantic.Field(default=(128, 128), min_length=1)
+    hidden: Widths = (128, 128)
     mask_dead: bool = True
     normalize_inputs: bool = True
 
@@ -194,7 +199,7 @@ class MaddpgSettings(ReplaySettings):
     """
 
     arm: Literal["maddpg"] = "maddpg"
-    critic_hidden: tuple[int, ...] = pydantic.Field(default=(256, 256), min_length=1)
+    critic_hidden: Widths = (256, 256)
     critic_sees: Literal["state", "observations"] = "state"
     noise: float = pydantic.Field(default=0.3, ge=0, le=2)
     noise_left: float = pydantic.Field(default=0.3, ge=0, le=1)
@@ -219,7 +224,7 @@ class QmixSettings(ReplaySettings):
     learning_starts: int = pydantic.Field(default=2000, ge=1)
     max_grad_norm: float = pydantic.Field(default=10.0, gt=0)
     target_share: float = pydantic.Field(default=0.01, gt=0, le=1)
-    hidden: tuple[int, ...] = pydantic.Field(default=(64, 64), min_length=1)
+    hidden: Widths = (64, 64)
     bins: int = pydantic.Field(default=8, ge=2, le=256)
     mixer_width: int = pydantic.Field(default=32, ge=1, le=4096)
     epsilon: float = pydantic.Field(default=0.05, ge=0, le=1)
