@@ -85,13 +85,14 @@ def test_nothing_between_the_arms_is_undecided() -> None:
 @pytest.mark.parametrize(
     ("found", "verdict"),
     [
-        (Improvement(0.9, (0.6, 1.0), (0.7, 1.0), 0.01), "holds"),
-        (Improvement(0.9, (0.6, 1.0), (0.7, 1.0), 0.06), "undecided"),
-        (Improvement(0.7, (0.4, 0.9), (0.45, 0.85), 0.01), "undecided"),
-        (Improvement(0.1, (0.0, 0.3), (0.0, 0.25), 0.01), "does not hold"),
-        (Improvement(0.1, (0.0, 0.3), (0.0, 0.25), 0.2), "undecided"),
-        (Improvement(0.52, (0.42, 0.61), (0.44, 0.59), 0.7), "no difference"),
-        (Improvement(0.52, (0.38, 0.66), (0.41, 0.61), 0.7), "undecided"),
+        (Improvement(0.9, (0.6, 1.0), (0.7, 1.0), 0.01, 5), "holds"),
+        (Improvement(0.9, (0.6, 1.0), (0.7, 1.0), 0.06, 5), "undecided"),
+        (Improvement(0.7, (0.4, 0.9), (0.45, 0.85), 0.01, 5), "undecided"),
+        (Improvement(0.1, (0.0, 0.3), (0.0, 0.25), 0.01, 5), "does not hold"),
+        (Improvement(0.1, (0.0, 0.3), (0.0, 0.25), 0.2, 5), "undecided"),
+        (Improvement(0.52, (0.42, 0.61), (0.44, 0.59), 0.7, 5), "no difference"),
+        (Improvement(0.5, (0.5, 0.5), (0.5, 0.5), 1.0, 1), "undecided"),
+        (Improvement(0.52, (0.38, 0.66), (0.41, 0.61), 0.7, 5), "undecided"),
     ],
 )
 def test_the_rule(found: Improvement, verdict: str) -> None:

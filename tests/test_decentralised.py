@@ -8,7 +8,7 @@ from hipg_bench.evaluation.episodes import Plan
 
 pytestmark = pytest.mark.skipif(not WORKING, reason="no sandbox works on this machine")
 SHORT = TASK.override(horizon=12)
-WORLDS = range(4)
+WORLDS = range(8)
 
 HONEST = {
     "remembers its own observations and counts steps": f"""
@@ -44,7 +44,7 @@ SHARING = {
 def test_an_agent_that_needs_nobody_else_is_decentralised(tmp_path, name):
     verdict = verify(SHORT, policy(tmp_path, acting(HONEST[name]), spec=SHORT), Plan(threads=1), WORLDS)
     assert verdict.decentralised, str(verdict)
-    assert 120 < verdict.compared <= 4 * 4 * 12  # four worlds, four agents, twelve steps, less what died
+    assert 240 < verdict.compared <= 8 * 4 * 12  # eight worlds, four agents, twelve steps, less what died
     assert str(verdict).startswith("decentralised")
 
 

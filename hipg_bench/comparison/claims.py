@@ -3,9 +3,10 @@
 A claim says that values x are above values y: final scores of two arms, gains over a part of the training.
 It **holds** if the 95 % interval of P(improvement) lies above 1/2 and the permutation test is below 0.05; it
 **does not hold** if the interval lies below 1/2 and the test is below 0.05. There is **no difference** if the
-90 % interval lies within 1/2 +- 0.1, which is the equivalence test of two one-sided tests at 0.05; else it is
-**undecided**. Tasks where one side has no run are left out, and so are runs that began with another run's
-policy. There is no correction for the number of claims: about one in twenty would pass by luck.
+90 % interval lies within 1/2 +- 0.1, the equivalence test of two one-sided tests at 0.05, and each task has
+five runs of both sides, since the interval of fewer says nothing; else it is **undecided**. Tasks where one
+side has no run are left out, and so are runs that began with another run's policy. There is no correction for
+the number of claims: about one in twenty would pass by luck.
 
 Pooling over tasks hides an arm that is better on one and worse on another, so each task has a verdict of its
 own, by the same rule, with Holm's correction (1979) for the number of tasks in the claim.
@@ -26,6 +27,7 @@ from jaxtyping import Float
 
 from hipg_bench.comparison.improvement import Improvement, Stratum, improvement
 from hipg_bench.comparison.traces import Trace
+from hipg_bench.evaluation.statistics import METHOD_RUNS
 
 Verdict = Literal["holds", "does not hold", "no difference", "undecided", "too few runs"]
 Runs = Sequence[Trace]
@@ -140,7 +142,8 @@ def verdict(found: Improvement) -> Verdict:
     if found.chance < _LEVEL and not low <= 0.5 <= high:
         return "holds" if low > 0.5 else "does not hold"
     low, high = found.ci90
-    return "no difference" if low > 0.5 - _ALIKE and high < 0.5 + _ALIKE else "undecided"
+    alike = found.fewest >= METHOD_RUNS and low > 0.5 - _ALIKE and high < 0.5 + _ALIKE
+    return "no difference" if alike else "undecided"
 
 
 def _growth(runs: Runs, pairs: Sequence[tuple[str, str]]) -> dict[str, Stratum]:

@@ -47,7 +47,14 @@ _ARMS: dict[str, tuple[str, str, str]] = {
     "qmix": ("QMIX", "#AA4499", "D"),
 }
 """Name, colour (told apart by the colour-blind, after Okabe and Ito) and marker (the paper's)."""
-_VARIANTS = (("#000000", "s"), ("#56B4E9", "v"), ("#CC79A7", "<"), ("#999933", ">"))
+_VARIANTS = (
+    ("#000000", "s"),
+    ("#56B4E9", "v"),
+    ("#CC79A7", "<"),
+    ("#999933", ">"),
+    ("#882255", "p"),
+    ("#44AA99", "d"),
+)
 """Colour and marker of variants, in the order of their names."""
 _REPS = 1000
 _INK, _PALE = "#222222", "#8a8a8a"

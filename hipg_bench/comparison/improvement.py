@@ -30,6 +30,7 @@ class Improvement:
     Attributes:
         p: P(improvement).
         ci95, ci90: its stratified bootstrap intervals.
+        fewest: values of the smallest sample.
         chance: two-sided p-value of the permutation test: how often labels drawn at random within every
             stratum bring P as far from 1/2.
     """
@@ -38,6 +39,7 @@ class Improvement:
     ci95: tuple[float, float]
     ci90: tuple[float, float]
     chance: float
+    fewest: int
 
 
 def improvement(strata: Sequence[Stratum], *, reps: int = _REPS, seed: int = 1) -> Improvement:
@@ -50,7 +52,8 @@ def improvement(strata: Sequence[Stratum], *, reps: int = _REPS, seed: int = 1) 
     # the data themselves are one of the ways in which labels may fall
     as_far = np.abs(shuffled - 0.5) >= abs(p - 0.5) - 1e-12
     ci95, ci90 = statistics.improvement_intervals(ours, theirs, (0.95, 0.9), reps=reps, seed=seed)
-    return Improvement(p, ci95, ci90, float((1 + as_far.sum()) / (1 + reps)))
+    fewest = min(min(len(x), len(y)) for x, y in strata)
+    return Improvement(p, ci95, ci90, float((1 + as_far.sum()) / (1 + reps)), fewest)
 
 
 def _dealt(x: Values, y: Values, reps: int, chance: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -137,9 +137,9 @@ def verify(spec: TaskSpec, policy: Policy, plan: Plan, worlds: Sequence[int]) ->
     for record in recorder.records:
         if len(record.episode_id) < 2:
             continue  # played world by world, since the batch failed
-        first = chance.integers(record.num_agents, size=len(record.episode_id))
-        for turn in range(min(_REPLAYS, record.num_agents)):
-            target = (first + turn) % record.num_agents
+        # an order for each world by itself: agents that share between worlds are not always both unchanged
+        order = np.stack([chance.permutation(record.num_agents) for _ in record.episode_id])
+        for target in order.T[:_REPLAYS]:
             sizes = _replay(policy, record, target, chance)
             compared += int(np.isfinite(sizes).sum())
             for b, agent in enumerate(target.tolist()):
