@@ -59,7 +59,11 @@ def replacing(path: Path, *, sealed: bool = False) -> Generator[Path]:
     with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=path.parent) as folder:
         # the ending stays: encoders and savers choose the format by it
         temporary = Path(folder) / f"new{path.suffix}"
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        temporary.unlink()
         yield temporary
+        temporary.chmod(mode)  # some savers make files that nobody else may read, whatever the umask
         if sealed:
             _seal(path, temporary)
         temporary.replace(path)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from hipg_bench import spec as specs
@@ -39,15 +41,77 @@ def tasks() -> Mapping[str, TaskSpec]:
     return {path.stem: specs.load(path) for path in files}
 
 
+_added: dict[str, TaskSpec] = {}
+"""Tasks that this process was given beside those of the benchmark, by name."""
+
+
 def task_spec(task: str) -> TaskSpec:
-    """Return one task's spec.
+    """Return the spec of a task of the benchmark, or of one that `add_task` was given.
 
     Raises:
         UnknownNameError: no such task; the message holds the nearest name.
     """
-    if task not in tasks():
-        raise UnknownNameError(f"no task {task!r}{hint(task, tasks())}")
-    return tasks()[task]
+    known = tasks() if task in tasks() else _added
+    if task not in known:
+        raise UnknownNameError(f"no task {task!r}{hint(task, [*tasks(), *_added])}")
+    return known[task]
+
+
+def add_task(spec: TaskSpec) -> TaskSpec:
+    """Make a task known by its name to all functions of this process that take a name.
+
+    Raises:
+        SpecError: another task has this name, or a number of the family is not allowed.
+    """
+    family_of(spec)
+    known = tasks().get(spec.task) or _added.get(spec.task)
+    if known is not None and known.fingerprint != spec.fingerprint:
+        raise SpecError(f"{spec.task}: there is another task of this name: choose a different one")
+    if spec.task not in tasks():
+        _added[spec.task] = spec
+    return spec
+
+
+def read_task(path: str | Path) -> TaskSpec:
+    """Read a task file of your own; its name is known in this process from then on.
+
+    Raises:
+        SpecError: the file does not hold a valid task, or another task has its name.
+        OSError: it cannot be read.
+    """
+    return add_task(specs.load(Path(path)))
+
+
+def vary(spec: TaskSpec, **changes: Any) -> TaskSpec:
+    """A task with some numbers changed, under a name of its own that tells them.
+
+    Args:
+        spec: the task.
+        **changes: as `TaskSpec.override` takes them.
+
+    Returns:
+        The changed task, known in this process from then on; ``spec`` itself where nothing changes. It has
+        no anchors: its scores are not those of the task that it was made from.
+
+    Raises:
+        SpecError: a change that is not allowed.
+    """
+    changed = spec.override(**changes)
+    if changed.fingerprint == spec.fingerprint:
+        return spec
+    told = "_".join(f"{name}-{_slug(value)}" for name, value in sorted(changes.items()))
+    name = f"{spec.task}_{told}"
+    if len(name) > _LONGEST_NAME:
+        name = f"{spec.task}_{changed.fingerprint}"
+    return add_task(changed.model_copy(update={"task": name, "tags": ()}))
+
+
+_LONGEST_NAME = 64
+
+
+def _slug(value: Any) -> str:
+    """A value as a part of a task's name, which is also a file's."""
+    return re.sub(r"[^a-z0-9]+", "-", str(value).lower().replace("-", "minus")).strip("-")
 
 
 def tagged(tag: str) -> tuple[str, ...]:

@@ -118,6 +118,11 @@ class TaskSpec(Params):
         low, high = self.anchors.random.mean, self.anchors.reference.mean
         return (episode_return - low) / (high - low)
 
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names that `override` takes."""
+        return (*_OWN_NUMBERS, "weights", *self.params)
+
     def override(self, **changes: Any) -> TaskSpec:
         """Return this spec with some numbers changed, anchors dropped where behaviour changed.
 
@@ -128,10 +133,8 @@ class TaskSpec(Params):
         """
         changes = {name: _plain(value, f"{self.task}: {name}") for name, value in changes.items()}
         values = self.model_dump()
-        own = {"num_agents", "horizon", "control_step", "clip_actions", "graded_health"}
-        own |= {"reward_dead", "dead_observation"}
         for name, value in changes.items():
-            if name in own:
+            if name in _OWN_NUMBERS:
                 values[name] = value
             elif name == "weights":
                 if not isinstance(value, Mapping):
@@ -145,13 +148,18 @@ class TaskSpec(Params):
             elif name in self.params:
                 values["params"] = {**values["params"], name: value}
             else:
-                raise SpecError(
-                    f"{self.task}: no field {name!r}{hint(name, own | {'weights'} | set(self.params))}"
-                )
+                raise SpecError(f"{self.task}: no field {name!r}{hint(name, self.numbers)}")
         changed = parse(TaskSpec, values, self.task)
         if changed.fingerprint == self.fingerprint:
             return changed
         return changed.model_copy(update={"anchors": None, "calibration": {}})
+
+
+_OWN_NUMBERS = (
+    "num_agents", "horizon", "control_step", "clip_actions", "graded_health", "reward_dead",
+    "dead_observation",
+)  # fmt: skip
+"""Fields of a spec that `TaskSpec.override` changes beside those of the family."""
 
 
 def _plain(value: Any, what: str) -> Any:
@@ -201,3 +209,13 @@ def load(path: Path) -> TaskSpec:
     if spec.task != path.stem:
         raise SpecError(f"{path}: holds the task {spec.task!r}; a task file is named after its task")
     return spec
+
+
+def to_toml(spec: TaskSpec) -> str:
+    """A task file's text, without anchors and calibration."""
+    values = spec.model_dump(mode="json", exclude={"anchors", "calibration"})
+    tables = {name: values.pop(name) for name in ("params", "weights")}
+    lines = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in values.items()]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"

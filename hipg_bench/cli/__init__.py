@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.core
@@ -61,11 +61,30 @@ class _Commands(typer.core.TyperGroup):
 
 app = typer.Typer(
     cls=_Commands,
-    help="Teams that lose members: 3D tasks, trained teams, scores and films.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_show_locals=False,
 )
+
+
+def _print_version(wanted: bool) -> bool:
+    if wanted:
+        from hipg_bench import __version__
+
+        console.say(f"hipg-bench {__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Teams that lose members: 3D tasks, trained teams, scores and films."""
+
+
 app.command()(evaluate.evaluate)
 app.command()(compare.compare)
 app.command()(export.export)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import NumAgentsOption, SetOption, TaskArgument, task_of
 from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
@@ -18,22 +20,26 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    task: Annotated[str, typer.Argument(help="The task's name.")],
+    task: TaskArgument,
+    num_agents: NumAgentsOption = None,
+    setting: SetOption = None,
     split: Annotated[
         str, typer.Option(help="Or only the anchors in: shift, forced_death, ad_hoc.")
     ] = "standard",
     episodes: Annotated[int, typer.Option(min=1, help="Per measured policy.")] = 1000,
     threads: Annotated[int, typer.Option(min=0, help="Physics threads, 0 for all cores.")] = 0,
-    write: Annotated[bool, typer.Option("--write", help="Freeze the numbers in the task file.")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Write the numbers into the task file.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
 ) -> None:
     """Measure a task's anchors, its hazard leverage, and what policies without eyes score."""
-    from hipg_bench import registry
     from hipg_bench.evaluation import calibration
     from hipg_bench.paths import data_folder, is_installed
 
-    spec = registry.task_spec(task)
-    if write and is_installed():
+    spec = task_of(task, num_agents, setting)
+    file = Path(task) if task.endswith(".toml") else data_folder("tasks") / f"{task}.toml"
+    if write and file.stem != spec.task:
+        raise SpecError("--write is for the numbers of a task file, without --num-agents and --set")
+    if write and is_installed() and not task.endswith(".toml"):
         raise SpecError(
             f"--write changes {data_folder('tasks')}, which belongs to the installed package: work in a "
             f"checkout, or copy the numbers of --json into a task file of your own"
@@ -45,7 +51,7 @@ def calibrate(
         progress = _advance(bars, episodes)
         measured = calibration.calibrate(spec, episodes, threads=threads, progress=progress)
     if write:
-        calibration.write(measured.spec, data_folder("tasks") / f"{task}.toml")
+        calibration.write(measured.spec, file)
     if as_json:
         facts = measured.spec.model_dump(mode="json", include={"task", "version", "anchors", "calibration"})
         console.show_json(facts | {"fingerprint": spec.fingerprint, "scores": dict(measured.scores)})

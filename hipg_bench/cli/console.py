@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import unicodedata
+from types import TracebackType
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -18,9 +20,14 @@ err = Console(stderr=True, highlight=False)
 """Everything else."""
 
 
+PLAIN_SECONDS = 30.0
+"""Time between two lines of progress where the error stream is no terminal, s."""
+
+
 def progress() -> Progress:
-    """A progress display with the time left; silent when nobody watches."""
-    return Progress(
+    """A progress display with the time left; where the error stream is no terminal, a line every 30 s."""
+    kind = Progress if sys.stderr.isatty() else _PlainProgress
+    return kind(
         TextColumn("{task.description:<18}", markup=False),
         BarColumn(bar_width=None),
         TextColumn("{task.percentage:>3.0f} %"),
@@ -30,6 +37,39 @@ def progress() -> Progress:
         console=err,
         transient=True,
         disable=not sys.stderr.isatty(),
+    )
+
+
+class _PlainProgress(Progress):
+    """Progress as plain lines, so that the log of a job is never silent for minutes."""
+
+    def __enter__(self) -> _PlainProgress:
+        """Begin to print lines."""
+        self._stopped = threading.Event()
+        self._printer = threading.Thread(target=self._print_lines, daemon=True)
+        self._printer.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Print no more lines."""
+        self._stopped.set()
+        self._printer.join()
+
+    def _print_lines(self) -> None:
+        while not self._stopped.wait(PLAIN_SECONDS):
+            running = [task for task in self.tasks if task.completed and not task.finished]
+            if running:
+                warn("; ".join(_progress_line(task) for task in running))
+
+
+def _progress_line(task: Task) -> str:
+    """How far a task is, such as ``films: 35 % after 90 s, about 160 s left``."""
+    share = "" if task.total is None else f"{task.percentage:.0f} % "
+    left = task.time_remaining
+    return f"{task.description}: {share}after {task.elapsed or 0:.0f} s" + (
+        "" if left is None else f", about {left:.0f} s left"
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import AgentOption, NumAgentsOption, SetOption, calibrate_hint, task_of
 
 if TYPE_CHECKING:
     from hipg_bench.evaluation.episodes import Plan
@@ -20,12 +21,18 @@ _QUICK = 32
 
 
 def evaluate(
-    agent: Annotated[
-        str, typer.Option(help="A bundled agent's name, or the path of a bundle.")
-    ] = "mappo_minhealth",
+    agent: AgentOption = "mappo_minhealth",
     tasks: Annotated[
-        str, typer.Option(help="Task names with commas between, or: standard, paper, all.")
-    ] = "standard",
+        str | None,
+        typer.Option(
+            "--tasks",
+            "--task",
+            help="Task names or task files (.toml) with commas between, a tag such as standard, or all. "
+            "By default the standard tasks, and for a training run its own.",
+        ),
+    ] = None,
+    num_agents: NumAgentsOption = None,
+    setting: SetOption = None,
     split: Annotated[
         str, typer.Option(help="standard, shift, forced_death, ad_hoc, or all, a folder for each.")
     ] = "standard",
@@ -50,9 +57,12 @@ def evaluate(
     from hipg_bench.evaluation import runner, splits
     from hipg_bench.evaluation.episodes import Plan
     from hipg_bench.paths import new_folder
-    from hipg_bench.policies.bundle import load_agent
+    from hipg_bench.policies.trained import Trained, find_agent
 
-    who, suite = load_agent(agent), suite_of(tasks)
+    who = find_agent(agent)
+    if tasks is None:
+        tasks = ",".join(who.tasks) if isinstance(who, Trained) and who.tasks else "standard"
+    suite = suite_of(tasks, num_agents, setting)
     plan = Plan(seed, _QUICK if quick else episodes, num_envs, threads)
     films = (0 if quick else 1) if video is None else video
     for name in splits.SPLITS if split == "all" else (split,):
@@ -84,18 +94,25 @@ def _evaluate(who: Agent, suite: Suite, folder: Path, plan: Plan, films: int) ->
         )  # fmt: skip
 
 
-def suite_of(tasks: str) -> Suite:
-    """The tasks named on the command line."""
+def suite_of(tasks: str, num_agents: int | None = None, changes: list[str] | None = None) -> Suite:
+    """The tasks named on the command line, with the numbers given there.
+
+    Raises:
+        SpecError: a task file or a number that is not allowed.
+        UnknownNameError: no such task or tag.
+    """
     from hipg_bench import registry
     from hipg_bench.evaluation.runner import Suite
 
-    if tasks == "all":
-        return Suite("all", tuple(registry.tasks().values()))
-    if tasks in ("standard", "paper"):
-        names = registry.tagged(tasks)
-        return Suite(tasks, tuple(registry.task_spec(name) for name in names))
-    names = dict.fromkeys(name.strip() for name in tasks.split(",") if name.strip())
-    return Suite("custom", tuple(registry.task_spec(name) for name in names))
+    tags = {tag for spec in registry.tasks().values() for tag in spec.tags}
+    name, names = tasks, list(registry.tasks())
+    if tasks in tags:
+        names = list(registry.tagged(tasks))
+    elif tasks != "all":
+        name, names = "custom", [part.strip() for part in tasks.split(",") if part.strip()]
+    specs = tuple(task_of(one, num_agents, changes) for one in dict.fromkeys(names))
+    own = any(spec.task not in registry.tasks() for spec in specs)
+    return Suite("custom" if own else name, specs)
 
 
 def _print(results: dict[str, Any], folder: Path) -> None:
@@ -124,6 +141,11 @@ def _print(results: dict[str, Any], folder: Path) -> None:
             f"\nscore, interquartile mean over {whole['tasks']} tasks{zero}: "
             f"{number(whole['score_iqm'])} {interval(whole['score_iqm_ci95'])}"
         )
+    for task in results["tasks"]:
+        if task["score"] is None:
+            console.say(
+                f"no score on {task['task']}, which has no score scale yet: {calibrate_hint(task['task'])}"
+            )
     if results["episodes_per_policy"] < 320:
         console.say(f"{results['episodes_per_policy']} episodes per policy: not for comparison")
     for trouble in results["film_trouble"]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import AgentOption, NumAgentsOption, SetOption, TaskOption, task_for
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from hipg_bench.policies.policy import Policy
     from hipg_bench.spec import TaskSpec
 
-AgentOption = Annotated[str, typer.Option(help="A bundled agent's name, or the path of a bundle.")]
-TaskOption = Annotated[str, typer.Option(help="The task's name.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Evaluation seed.")]
 EpisodeOption = Annotated[int, typer.Option(min=0, help="World of an evaluation with that seed.")]
 TrainSeedOption = Annotated[
@@ -28,8 +27,10 @@ TrainSeedOption = Annotated[
 
 
 def video(
-    task: TaskOption,
+    task: TaskOption = None,
     agent: AgentOption = "mappo_minhealth",
+    num_agents: NumAgentsOption = None,
+    setting: SetOption = None,
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,
@@ -39,17 +40,17 @@ def video(
     fps: Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")] = 30,
 ) -> None:
     """Play one episode and film it."""
-    from hipg_bench import registry
     from hipg_bench.evaluation.episodes import Plan
-    from hipg_bench.policies.bundle import load_agent
+    from hipg_bench.policies.trained import find_agent
     from hipg_bench.rendering import film
 
-    who, spec = load_agent(agent), registry.task_spec(task)
+    who = find_agent(agent)
+    spec = task_for(who, task, num_agents, setting)
     policy = _policy(who, spec, train_seed)
-    path = out or Path("runs") / f"{task}-{who.name}-{seed}-{episode}.mp4"
+    path = out or Path("runs") / f"{spec.task}-{who.name}-{seed}-{episode}.mp4"
     plan = Plan(seed=seed, episodes=episode + 1, threads=1)
     with console.progress() as bars:
-        bar = bars.add_task(f"play {task}", total=1.0)
+        bar = bars.add_task(f"play {spec.task}", total=1.0)
         row = plan.play(spec, policy, [episode], lambda done: bars.advance(bar, done))[0]
         states = plan.record(spec, policy, row)
         bar = bars.add_task("film", total=None)
@@ -61,8 +62,10 @@ def video(
 
 
 def view(
-    task: TaskOption,
+    task: TaskOption = None,
     agent: AgentOption = "mappo_minhealth",
+    num_agents: NumAgentsOption = None,
+    setting: SetOption = None,
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,
@@ -70,11 +73,12 @@ def view(
 ) -> None:
     """Watch an agent play in an interactive window, episode after episode."""
     from hipg_bench import registry
-    from hipg_bench.policies.bundle import load_agent
+    from hipg_bench.policies.trained import find_agent
     from hipg_bench.rendering import viewer
 
     viewer.check_display()
-    who, spec = load_agent(agent), registry.task_spec(task)
+    who = find_agent(agent)
+    spec = task_for(who, task, num_agents, setting)
     env = registry.make(spec, 1, seed, threads=1)
     viewer.watch(spec, _rows(env, _policy(who, spec, train_seed), seed, episode), speed=speed)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import NumAgentsOption, SetOption, TaskArgument, quoted, task_of
+from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
     from hipg_bench.layout import Layout
@@ -40,11 +43,16 @@ def tasks(context: typer.Context, as_json: AsJson = False) -> None:
 
 
 @app.command()
-def show(task: Annotated[str, typer.Argument(help="The task's name.")], as_json: AsJson = False) -> None:
+def show(
+    task: TaskArgument,
+    num_agents: NumAgentsOption = None,
+    setting: SetOption = None,
+    as_json: AsJson = False,
+) -> None:
     """Print a task's numbers, and its observation, action and joint-state tables."""
     from hipg_bench import registry
 
-    spec = registry.task_spec(task)
+    spec = task_of(task, num_agents, setting)
     layout = registry.family_of(spec).layout
     vectors = {"observation": layout.observation, "action": layout.action, "state": layout.state}
     if as_json:
@@ -70,6 +78,28 @@ def show(task: Annotated[str, typer.Argument(help="The task's name.")], as_json:
                 shape, block["unit"], block["frame"], block["visible"],
             )  # fmt: skip
         console.show(rows)
+
+
+@app.command()
+def copy(
+    task: TaskArgument,
+    file: Annotated[Path, typer.Argument(help="The new task file, NAME.toml; NAME becomes the task's name.")],
+    num_agents: NumAgentsOption = None,
+    setting: SetOption = None,
+) -> None:
+    """Write a task file of your own, with a task's numbers, some of them changed."""
+    from hipg_bench import registry
+    from hipg_bench.paths import write_text
+    from hipg_bench.spec import TaskSpec, parse, to_toml
+
+    if file.suffix != ".toml" or file.exists():
+        reason = "it exists" if file.exists() else "task files end in .toml"
+        raise SpecError(f"{file}: {reason}; choose another name")
+    spec = task_of(task, num_agents, setting)
+    own = spec.model_copy(update={"task": file.stem, "tags": (), "anchors": None, "calibration": {}})
+    registry.add_task(parse(TaskSpec, own.model_dump(), str(file)))
+    write_text(file, to_toml(own))
+    console.say(f"{file}: change what you like, then: hipg-bench calibrate {quoted(file)} --write")
 
 
 def _blocks(vector: Layout) -> list[dict[str, Any]]:

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import (
+    NumAgentsOption,
+    calibrate_hint,
+    complete_task,
+    parse_pairs,
+    quoted,
+    task_of,
+    task_option,
+)
 from hipg_bench.errors import SpecError, hint
 
 if TYPE_CHECKING:
     from hipg_bench.learning.settings import AnySettings
+    from hipg_bench.spec import TaskSpec
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="Folder of the run; an unfinished run in it goes on.")],
-    task: Annotated[str | None, typer.Option(help="The task's name.")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="A task's name or a task file (.toml).", autocompletion=complete_task)
+    ] = None,
+    num_agents: NumAgentsOption = None,
     arm: Annotated[
         str, typer.Option(help="MAPPO by its credit: min_health, central, local; or maddpg, qmix.")
     ] = "min_health",
@@ -29,7 +42,17 @@ def train(
         int | None, typer.Option(min=1, help="Environment steps, by default the preset's.")
     ] = None,
     setting: Annotated[
-        list[str] | None, typer.Option("--set", help="Another setting, as name=value; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Another setting of the training or number of the task, as name=value; may be repeated.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the run, by default runs/TASK-ARM-seedK. An unfinished run in it is resumed."
+        ),
     ] = None,
     threads: Annotated[
         int, typer.Option(min=1, help="Of physics and of torch. One run per core is faster.")
@@ -48,37 +71,69 @@ def train(
     from hipg_bench.processes import usable_cores
 
     if sweep is not None and status:
-        _tell(sweep, out, workers or usable_cores())
+        _tell(sweep, out or Path("runs") / sweep.stem, workers or usable_cores())
         return
     if sweep is not None:
-        _train_many(sweep, out, workers or usable_cores())
+        _train_many(sweep, out or Path("runs") / sweep.stem, workers or usable_cores())
         return
 
     import torch
 
-    from hipg_bench.learning.settings import PRESETS
+    from hipg_bench.learning.settings import ARMS, PRESETS
 
     torch.set_num_threads(threads)
     if preset not in PRESETS:
         raise SpecError(f"no preset {preset!r}{hint(preset, PRESETS)}")
-    changes: dict[str, Any] = {"arm": arm, "seed": seed, **_parsed(setting or [])}
+    if arm not in ARMS:
+        raise SpecError(f"no arm {arm!r}{hint(arm, ARMS)}")
+    pairs = [pair for pair in setting or [] if pair.partition("=")[0] not in ARMS[arm].model_fields]
+    spec = _task(str(task), num_agents, pairs, ARMS[arm].model_fields)
+    own = [pair for pair in setting or [] if pair not in pairs]
+    changes: dict[str, Any] = {"arm": arm, "seed": seed, **parse_pairs(own)}
     if steps is not None:
         changes["steps"] = steps
-    settings = PRESETS[preset](task, **changes)
+    settings = PRESETS[preset](spec.task, **changes)
+    folder = out or Path("runs") / "-".join(
+        [spec.task, arm, *([preset] if preset != "recommended" else []), f"seed{seed}"]
+    )
     options = [
-        f"--task {task}",
+        f"--task {quoted(str(task))}",
+        *([] if num_agents is None else [f"--num-agents {num_agents}"]),
         f"--arm {arm}",
         f"--preset {preset}",
         f"--seed {seed}",
-        *(f"--set {pair}" for pair in setting or []),
+        *(f"--set {quoted(pair)}" for pair in setting or []),
     ]
-    command = " ".join(["hipg-bench train", *options, f"--steps {settings.steps}", f"--out {out}"])
-    _train_one(settings, out, command)
+    command = " ".join(["hipg-bench train", *options, f"--steps {settings.steps}", f"--out {quoted(folder)}"])
+    _train_one(settings, folder, command)
+
+
+def _task(task: str, num_agents: int | None, pairs: list[str], settings: Collection[str]) -> TaskSpec:
+    """The task with some numbers changed.
+
+    Raises:
+        SpecError: a name that is neither the task's nor one of the learner's settings.
+    """
+    numbers = task_of(task).numbers
+    for name in parse_pairs(pairs):
+        if name not in numbers:
+            raise SpecError(
+                f"--set {name}: neither a setting of this training nor a number of {task}"
+                f"{hint(name, [*settings, *numbers])}"
+            )
+    return task_of(task, num_agents, pairs)
 
 
 def _train_one(settings: AnySettings, out: Path, command: str) -> None:
     from hipg_bench.learning.run import train as run
 
+    if _is_finished(settings, out):
+        console.say(
+            f"{out} is finished already: {settings.steps:,} environment steps. "
+            f"Another --seed or --out begins a new run."
+        )
+        _print_result(settings, out)
+        return
     console.say(
         f"{settings.task}, arm {settings.arm}, seed {settings.seed}: "
         f"{settings.steps:,} environment steps into {out}"
@@ -90,7 +145,49 @@ def _train_one(settings: AnySettings, out: Path, command: str) -> None:
             bars.update(bar, completed=iteration, description=f"return {log.get('return', float('nan')):.4g}")
 
         run(settings, out, command=command, report=report)
+    _print_result(settings, out)
+
+
+def _is_finished(settings: AnySettings, out: Path) -> bool:
+    """Whether a folder holds this very run, with all its steps."""
+    from hipg_bench.policies.trained import RECORD, read_record
+
+    if not (out / RECORD).is_file():
+        return False
+    record = read_record(out)
+    return record.env_steps >= settings.steps and record.settings.model_dump() | {
+        "steps": settings.steps,
+        "eval_every": settings.eval_every,
+    } == json.loads(settings.model_dump_json())
+
+
+def _print_result(settings: AnySettings, out: Path) -> None:
+    """How good the policy is, where it lies, and what to do with it."""
+    from hipg_bench.learning.run import last_evaluation
+    from hipg_bench.policies.bundle import agents, load_agent
+    from hipg_bench.registry import tagged
+
+    found = last_evaluation(out)
+    if found is not None:
+        at = f"over {found.episodes} episodes without exploration, after {found.steps:,} steps"
+        if found.score is None:
+            console.say(f"return {found.mean_return:.2f} {at}")
+            console.say(f"{settings.task} has no score scale yet: {calibrate_hint(settings.task)}")
+        else:
+            console.say(
+                f"score {found.score:.2f} {console.interval(found.score_ci95)}, "
+                f"return {found.mean_return:.2f} {at}"
+            )
     console.say(f"policy: {out / 'policy.safetensors'}, curve: {out / 'curve.csv'}")
+    run = quoted(out) + task_option(settings.task)
+    console.say("next:")
+    console.say(f"  hipg-bench evaluate --agent {run}")
+    console.say(f"  hipg-bench video --agent {run} --out {quoted(out / 'film.mp4')}")
+    reference = "mappo_minhealth"
+    if reference in agents() and settings.task in load_agent(reference).tasks:
+        console.say(f"  hipg-bench compare {quoted(out)} {reference}")
+    if settings.task in tagged("standard"):
+        console.say(f"  hipg-bench submit init my_agent --from-run {quoted(out)}")
 
 
 def _train_many(sweep: Path, out: Path, workers: int) -> None:
@@ -141,17 +238,3 @@ def _tell(sweep: Path, out: Path, workers: int) -> None:
         for state in ("finished", "running", "stopped", "waiting")
     )
     console.say(f"{states}; time left with {workers} at a time: {hours}")
-
-
-def _parsed(pairs: list[str]) -> dict[str, Any]:
-    """``name=value`` options; a value that is not JSON is a string."""
-    parsed: dict[str, Any] = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not equals:
-            raise SpecError(f"--set takes name=value, got {pair!r}")
-        try:
-            parsed[name] = json.loads(value)
-        except json.JSONDecodeError:
-            parsed[name] = value
-    return parsed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import hashlib
 import io
 import json
@@ -23,13 +24,13 @@ from hipg_bench.learning import arithmetic, mappo, trial
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
 from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
 from hipg_bench.policies.network import load_network
-from hipg_bench.registry import task_spec
+from hipg_bench.policies.trained import POLICY, RECORD, read_record
+from hipg_bench.registry import task_spec, tasks
 
 _REPLAY = "replay"
 """Folder within the run's for what learners keep on disk beside checkpoints."""
 
-_RECORD = "train.json"
-_RESULTS = ("checkpoint.pt", "policy.safetensors", "learner.safetensors", "curve.csv", "tensorboard", _REPLAY)
+_RESULTS = ("checkpoint.pt", POLICY, "learner.safetensors", "curve.csv", "tensorboard", _REPLAY)
 """What a training writes beside it."""
 
 Log = dict[str, float]
@@ -110,19 +111,55 @@ def train(
         HipgError: the learner is built on TorchRL, which is not installed.
     """
     arithmetic.prepare()
-    with output_folder(out, _RECORD, _RESULTS, "training"):
+    with output_folder(out, RECORD, _RESULTS, "training"):
         remove_partial(out)
         _train_alone(settings, out, command, report)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluated:
+    """What the last periodic evaluation of a run found.
+
+    Attributes:
+        steps: environment steps before it.
+        episodes: how many were played.
+        mean_return: their mean return.
+        score: the same on the task's scale, None where it has none.
+        score_ci95: ends of the score's 95 % interval over the episodes, None without a score.
+    """
+
+    steps: int
+    episodes: int
+    mean_return: float
+    score: float | None
+    score_ci95: tuple[float, float] | None
+
+
+def last_evaluation(out: Path) -> Evaluated | None:
+    """The last periodic evaluation in a run's curve, None before the first."""
+    with (out / "curve.csv").open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("eval_return")]
+    if not rows:
+        return None
+    row, record = rows[-1], read_record(out)
+    ends = (float(row["score_low"]), float(row["score_high"])) if row.get("score") else None
+    return Evaluated(
+        steps=int(row["steps"]), episodes=trial.num_episodes(record.task),
+        mean_return=float(row["eval_return"]),
+        score=float(row["score"]) if ends else None, score_ci95=ends,
+    )  # fmt: skip
 
 
 def _train_alone(
     settings: AnySettings, out: Path, command: str, report: Callable[[int, Log], None] | None
 ) -> None:
     _check_not_lost(out)
-    if not (out / _RECORD).exists():
-        write_text(out / _RECORD, _record(settings, command, 0, 0.0))
+    if (out / RECORD).exists():
+        _check_same_task(settings.task, out)
+    else:
+        write_text(out / RECORD, _record(settings, command, 0, 0.0))
     learner = new_learner(settings, out)
-    checkpoint, curve, policy = out / "checkpoint.pt", out / "curve.csv", out / "policy.safetensors"
+    checkpoint, curve, policy = out / "checkpoint.pt", out / "curve.csv", out / POLICY
     rows: list[dict[str, Any]] = []
     if checkpoint.exists():
         check_seal(curve)
@@ -150,10 +187,24 @@ def _train_alone(
             if isinstance(learner, mappo.Trainer):
                 learner.save_networks(out / "learner.safetensors")
             write_text(curve, _table(rows), sealed=True)
-            write_text(out / _RECORD, _record(settings, command, steps, seconds))
+            write_text(out / RECORD, _record(settings, command, steps, seconds))
             learner.save(checkpoint)
     if not isinstance(learner, mappo.Trainer):
         shutil.rmtree(out / _REPLAY, ignore_errors=True)
+
+
+def _check_same_task(task: str, out: Path) -> None:
+    """Refuse to resume a run whose task had other numbers.
+
+    Raises:
+        ResumeError: it had, or the record is damaged.
+    """
+    try:
+        before = read_record(out)
+    except HipgError as error:
+        raise ResumeError(f"{error}; choose another --out") from error
+    if before.task != task:
+        raise ResumeError(f"{out} was trained on {before.task}, not {task}: choose another --out")
 
 
 def _check_not_lost(out: Path) -> None:
@@ -223,6 +274,8 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
             "python": platform.python_version(),
         },
     }
+    if spec.task not in tasks():
+        content["spec"] = spec.model_dump(mode="json")
     if isinstance(settings, Settings) and settings.start:
         content["start_fingerprint"] = hashlib.sha256(Path(settings.start).read_bytes()).hexdigest()[:12]
     if isinstance(settings, MaddpgSettings | QmixSettings):

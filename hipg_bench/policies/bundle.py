@@ -87,7 +87,7 @@ class Agent:
             BundleError: a file's name is not the only one for its number: ``seed00`` is not allowed.
         """
         if self.card.kind == "builtin":
-            return (0,) if task in self.tasks else ()
+            return (0,) if self._plays(registry.task_spec(task)) else ()
         if self.card.kind == "python":
             return tuple(sorted(self.card.tasks.get(task, ())))
         names = [path.stem for path in (self.folder / task).glob(f"seed*{self._ending}")]
