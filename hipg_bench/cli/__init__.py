@@ -31,6 +31,7 @@ from hipg_bench.cli import (
     figures,
     leaderboard,
     media,
+    rollout,
     submit,
     suite,
     tasks,
@@ -93,6 +94,7 @@ app.command()(collect.collect)
 app.command()(figures.figures)
 app.command()(media.video)
 app.command()(media.view)
+app.command()(rollout.rollout)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
 app.add_typer(submit.app, name="submit")

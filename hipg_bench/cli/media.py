@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from hipg_bench.env import BatchEnv
-    from hipg_bench.policies.bundle import Agent
     from hipg_bench.policies.policy import Policy
-    from hipg_bench.spec import TaskSpec
 
 SeedOption = Annotated[int, typer.Option(min=0, help="Evaluation seed.")]
 EpisodeOption = Annotated[int, typer.Option(min=0, help="World of an evaluation with that seed.")]
@@ -46,7 +44,7 @@ def video(
 
     who = find_agent(agent)
     spec = task_for(who, task, num_agents, setting)
-    policy = _policy(who, spec, train_seed)
+    policy = who.chosen_policy(spec, train_seed)
     path = out or Path("runs") / f"{spec.task}-{who.name}-{seed}-{episode}.mp4"
     plan = Plan(seed=seed, episodes=episode + 1, threads=1)
     with console.progress() as bars:
@@ -80,14 +78,7 @@ def view(
     who = find_agent(agent)
     spec = task_for(who, task, num_agents, setting)
     env = registry.make(spec, 1, seed, threads=1)
-    viewer.watch(spec, _rows(env, _policy(who, spec, train_seed), seed, episode), speed=speed)
-
-
-def _policy(who: Agent, spec: TaskSpec, train_seed: int | None) -> Policy:
-    """The chosen training's policy, else that of the first training there is."""
-    if train_seed is None:
-        train_seed = min(who.train_seeds(spec.task), default=0)
-    return who.policy(spec, train_seed)
+    viewer.watch(spec, _rows(env, who.chosen_policy(spec, train_seed), seed, episode), speed=speed)
 
 
 def _rows(env: BatchEnv, policy: Policy, seed: int, episode: int) -> Iterator[np.ndarray]:

@@ -63,6 +63,9 @@ def train(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Runs of a sweep at a time, by default one per core.")
     ] = None,
+    track: Annotated[
+        list[str] | None, typer.Option(help="Show the run in wandb or trackio too; may be repeated.")
+    ] = None,
     status: Annotated[bool, typer.Option("--status", help="Only say how far a sweep is.")] = False,
 ) -> None:
     """Train a team, or the many of a sweep; what was killed goes on with the same command."""
@@ -105,7 +108,7 @@ def train(
         *(f"--set {quoted(pair)}" for pair in setting or []),
     ]
     command = " ".join(["hipg-bench train", *options, f"--steps {settings.steps}", f"--out {quoted(folder)}"])
-    _train_one(settings, folder, command)
+    _train_one(settings, folder, command, tuple(track or ()))
 
 
 def _task(task: str, num_agents: int | None, pairs: list[str], settings: Collection[str]) -> TaskSpec:
@@ -124,7 +127,7 @@ def _task(task: str, num_agents: int | None, pairs: list[str], settings: Collect
     return task_of(task, num_agents, pairs)
 
 
-def _train_one(settings: AnySettings, out: Path, command: str) -> None:
+def _train_one(settings: AnySettings, out: Path, command: str, track: tuple[str, ...]) -> None:
     from hipg_bench.learning.run import train as run
 
     if _is_finished(settings, out):
@@ -144,7 +147,7 @@ def _train_one(settings: AnySettings, out: Path, command: str) -> None:
         def report(iteration: int, log: dict[str, float]) -> None:
             bars.update(bar, completed=iteration, description=f"return {log.get('return', float('nan')):.4g}")
 
-        run(settings, out, command=command, report=report)
+        run(settings, out, command=command, report=report, track=track)
     _print_result(settings, out)
 
 

@@ -88,6 +88,10 @@ class Plan:
         """The task as it is in a world of the split."""
         return splits.setting(self.split, spec).spec(spec, world // WORLDS_PER_SEED)
 
+    def episode_id(self, world: int) -> int:
+        """Which of the seed's episodes a world is."""
+        return world % WORLDS_PER_SEED
+
     def batches(self, done: Container[int] = ()) -> Iterator[list[int]]:
         """The worlds still to play, in order, those of one batch with the same evaluation seed."""
         for start in range(0, self.episodes, WORLDS_PER_SEED):
@@ -170,7 +174,7 @@ class Plan:
     ) -> tuple[Worlds, Watched]:
         """Build worlds of one block, and watch the policy that is to play them."""
         place = splits.setting(self.split, spec)
-        ids = np.array([world % WORLDS_PER_SEED for world in worlds])
+        ids = np.array([self.episode_id(world) for world in worlds])
         seed = self.eval_seed(spec.task, worlds[0])
         told = self.agent_seed(spec.task, worlds[0])
         made = Worlds(spec, place, seed, worlds[0] // WORLDS_PER_SEED, ids, threads, agent_seed=told)
@@ -221,7 +225,7 @@ class Plan:
             "split": self.split,
             "world": world,
             "eval_seed": self.told_seed(spec.task, world),
-            "episode_id": world % WORLDS_PER_SEED,
+            "episode_id": self.episode_id(world),
             "variant": splits.setting(self.split, spec).variant(block),
         }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -17,11 +18,11 @@ from typing import Any, Protocol, runtime_checkable
 
 import mujoco
 import torch
-from torch.utils.tensorboard import SummaryWriter
 
 from hipg_bench.errors import HipgError, ResumeError
 from hipg_bench.learning import arithmetic, mappo, trial
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
+from hipg_bench.learning.trackers import check_services, open_trackers, tag
 from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
 from hipg_bench.policies.network import load_network
 from hipg_bench.policies.trained import POLICY, RECORD, read_record
@@ -86,7 +87,12 @@ def new_learner(settings: AnySettings, out: Path) -> Learner:
 
 
 def train(
-    settings: AnySettings, out: Path, *, command: str, report: Callable[[int, Log], None] | None = None
+    settings: AnySettings,
+    out: Path,
+    *,
+    command: str,
+    report: Callable[[int, Log], None] | None = None,
+    track: tuple[str, ...] = (),
 ) -> None:
     """Train in a new folder, or go on where an earlier run with the same settings stopped.
 
@@ -103,17 +109,20 @@ def train(
         out: the folder.
         command: the command line, for the record.
         report: called after every iteration with its number and what was logged.
+        track: services that show the run beside TensorBoard, of `trackers.SERVICES`.
 
     Raises:
+        UnknownNameError: no such service.
         ResumeError: the folder holds a run with other settings, a damaged one, or files of somebody's that
             would be overwritten, or another process is training in it.
         BundleError: ``settings.start`` does not fit.
-        HipgError: the learner is built on TorchRL, which is not installed.
+        HipgError: the learner is built on TorchRL, or tracked by a service, which is not installed.
     """
+    check_services(track)
     arithmetic.prepare()
     with output_folder(out, RECORD, _RESULTS, "training"):
         remove_partial(out)
-        _train_alone(settings, out, command, report)
+        _train_alone(settings, out, command, report, track)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +160,11 @@ def last_evaluation(out: Path) -> Evaluated | None:
 
 
 def _train_alone(
-    settings: AnySettings, out: Path, command: str, report: Callable[[int, Log], None] | None
+    settings: AnySettings,
+    out: Path,
+    command: str,
+    report: Callable[[int, Log], None] | None,
+    track: tuple[str, ...],
 ) -> None:
     _check_not_lost(out)
     if (out / RECORD).exists():
@@ -170,7 +183,11 @@ def _train_alone(
     before = float(rows[-1]["seconds"]) if rows else 0.0
     worlds = trial.Trial(settings.task, threads=torch.get_num_threads())
     started = time.monotonic()
-    with SummaryWriter(str(out / "tensorboard"), purge_step=learner.iteration) as board:
+    with contextlib.ExitStack() as stack:
+        done = learner.iteration * settings.num_envs * settings.rollout
+        trackers = open_trackers(track, out, settings.model_dump(mode="json"), done)
+        for tracker in trackers:
+            stack.callback(tracker.close)
         while learner.iteration < settings.iterations:
             log = learner.iterate()
             learner.save_policy(policy)
@@ -179,8 +196,8 @@ def _train_alone(
             seconds = round(before + time.monotonic() - started, 1)
             steps = learner.iteration * settings.num_envs * settings.rollout
             rows.append({"iteration": learner.iteration, "steps": steps, "seconds": seconds, **log})
-            for name, value in log.items():
-                board.add_scalar(name, value, learner.iteration)
+            for tracker in trackers:
+                tracker.log({tag(name): value for name, value in log.items()}, steps)
             if report is not None:
                 report(learner.iteration, log)
             # the checkpoint goes last: what it says was done is then on disk

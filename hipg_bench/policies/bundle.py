@@ -118,6 +118,12 @@ class Agent:
                 self._check_trained(spec.task, train_seed)
                 return self._foreign(spec, train_seed, "python_runner", entry_point=self.card.entry_point)
 
+    def chosen_policy(self, spec: TaskSpec, train_seed: int | None) -> Policy:
+        """The policy of a training seed, by default of the first that there is; raises as `policy`."""
+        if train_seed is None:
+            train_seed = min(self.train_seeds(spec.task), default=0)
+        return self.policy(spec, train_seed)
+
     def fingerprint(self, task: str, train_seed: int = 0) -> str:
         """Twelve hex digits that tell one policy of this agent from another."""
         match self.card.kind:
