@@ -151,14 +151,14 @@ def test_a_file_that_holds_no_networks_is_refused(content: bytes, tmp_path: Path
 
 
 def test_a_critic_of_each_ones_own_cannot_be_asked(tmp_path: Path) -> None:
-    train(recommended("coop_nav-3", arm="local", **SMALL), tmp_path, command="test")
+    train(recommended("coop_nav-3", algorithm="local", **SMALL), tmp_path, command="test")
     with pytest.raises(HipgError, match="local critic"):
         audit.load(tmp_path / "learner.safetensors")
 
 
 def test_the_gradients_noise_is_that_of_a_plain_loop() -> None:
     """Without a baseline the weight is the target minus its mean: the covariance's trace, by NumPy."""
-    settings = recommended("hazard_nav-4", actor_hidden=(8,), attends=(), critic_hidden=(8,))
+    settings = recommended("hazard_nav-4", actor_hidden=(8,), attention_groups=(), critic_hidden=(8,))
     torch.manual_seed(1)
     actor, critic = networks(
         settings, make(settings.task).layout, clips=make(settings.task).spec.clip_actions

@@ -23,12 +23,12 @@ from hipg_bench.registry import task_spec
 SWEEP = """
 [[run]]
 tasks = ["coop_nav-3"]
-arms = ["min_health"]
+algorithms = ["min_health"]
 seeds = [0, 1, 2]
 settings = { num_envs = 4, rollout = 5, steps = 40, actor_hidden = [8], critic_hidden = [8] }
 [[run]]
 tasks = ["coop_nav-3"]
-arms = ["central"]
+algorithms = ["central"]
 label = "masked"
 settings = { num_envs = 4, rollout = 5, steps = 20, actor_hidden = [8], critic_hidden = [8] }
 """
@@ -106,7 +106,7 @@ def test_the_score_is_of_the_standard_worlds(trained, agents: Path) -> None:
     card = (agents / "mappo_minhealth" / "README.md").read_text()
     assert f"## {TASK}" in card
     assert f"| 1 | 40 | 0.00 | {got['score']:.3f} [" in card
-    assert "--arm min_health --preset recommended --seed K" in card
+    assert "--algorithm min_health --preset recommended --seed K" in card
 
 
 def test_nothing_is_overwritten_unasked(trained, agents: Path, tmp_path: Path) -> None:
@@ -180,15 +180,15 @@ def test_the_command(trained, tmp_path: Path) -> None:
 def test_a_bundle_holds_what_its_run_began_with(trained, agents: Path, tmp_path: Path) -> None:
     begun = tmp_path / "begun.safetensors"
     shutil.copy(agents / "mappo_minhealth" / TASK / "seed1.safetensors", begun)
-    text = SWEEP.split("[[run]]")[1].replace("actor_hidden", f'start = "{begun}", actor_hidden')
+    text = SWEEP.split("[[run]]")[1].replace("actor_hidden", f'initial_policy = "{begun}", actor_hidden')
     (tmp_path / "sweep.toml").write_text("[[run]]" + text.replace("[0, 1, 2]", "[1]"))
     (run,) = sweep.load(tmp_path / "sweep.toml", tmp_path / "runs")
     train(run.settings, run.out, command=run.command)
     list(artefacts.collect([run], tmp_path / "agents", plan=FEW))
     place = tmp_path / "agents" / "mappo_minhealth" / TASK
-    assert (place / "seed1.start.safetensors").read_bytes() == begun.read_bytes()
+    assert (place / "seed1.initial.safetensors").read_bytes() == begun.read_bytes()
     assert load_agent(place.parent).train_seeds(TASK) == (1,)
-    assert f'start="{TASK}/seedK.start.safetensors"' in (place.parent / "README.md").read_text()
+    assert f'initial_policy="{TASK}/seedK.initial.safetensors"' in (place.parent / "README.md").read_text()
     begun.write_bytes((place / "seed1.safetensors").read_bytes())
     with pytest.raises(BundleError, match="gone or has changed"):
         list(artefacts.collect([run], tmp_path / "others", plan=FEW))

@@ -21,10 +21,10 @@ from hipg_bench.registry import task_spec, tasks
 STEPS = np.linspace(1e4, 1e6, 50)
 
 
-def run(arm, task, seed, final, score=None, warm=False):
+def run(algorithm, task, seed, final, score=None, warm=False):
     """A run that rises straight to what it reaches."""
     score = final * STEPS / STEPS[-1] if score is None else score
-    return Trace(arm, task, seed, STEPS, score, True, warm, final)
+    return Trace(algorithm, task, seed, STEPS, score, True, warm, final)
 
 
 def named(judged, words, suite="paper"):
@@ -33,12 +33,12 @@ def named(judged, words, suite="paper"):
 
 
 def campaign(suite, level, seeds=4, noise=0.02):
-    """Runs of every arm around its level on the tasks of a suite."""
+    """Runs of every algorithm around its level on the tasks of a suite."""
     rng = np.random.default_rng(0)
     return [
-        run(arm, task, seed, at + noise * rng.normal())
+        run(algorithm, task, seed, at + noise * rng.normal())
         for task in claims.SUITES[suite]
-        for arm, at in level.items()
+        for algorithm, at in level.items()
         for seed in range(seeds)
     ]
 
@@ -71,7 +71,7 @@ def test_permutation_agrees_with_mann_whitney() -> None:
     assert improvement([(x, y)], reps=20_000).chance == pytest.approx(expected, abs=0.01)
 
 
-def test_nothing_between_the_arms_is_undecided() -> None:
+def test_nothing_between_the_algorithms_is_undecided() -> None:
     """And the test's level is what it says: of 200 sets without any difference, about 5 % pass."""
     rng = np.random.default_rng(1)
     verdicts = [
@@ -125,7 +125,11 @@ def test_tasks_with_too_few_runs_are_left_out_and_named() -> None:
 
 
 def test_runs_that_began_with_anothers_policy_are_left_out() -> None:
-    cold = [run(arm, "paper_nav-4", seed, 0.5) for arm in ("min_health", "central") for seed in range(4)]
+    cold = [
+        run(algorithm, "paper_nav-4", seed, 0.5)
+        for algorithm in ("min_health", "central")
+        for seed in range(4)
+    ]
     warm = [run("min_health", "paper_nav-4", seed, 0.9, warm=True) for seed in range(4, 8)]
     one = named(claims.judge_all(cold + warm), "min-health is above central")
     assert (one.runs, one.found.p) == ((4, 4), 0.5)
@@ -135,9 +139,9 @@ def test_tasks_that_contradict_each_other_are_seen_one_by_one() -> None:
     """Better by much on two tasks and worse by much on two: pooled nothing, each by itself clear."""
     rng, lead = np.random.default_rng(3), dict(zip(claims.STANDARD, (0.3, 0.3, -0.3, -0.3), strict=True))
     runs = [
-        run(arm, task, seed, (lead[task] if arm == "min_health" else 0) + 0.02 * rng.normal())
+        run(algorithm, task, seed, (lead[task] if algorithm == "min_health" else 0) + 0.02 * rng.normal())
         for task in claims.STANDARD
-        for arm in ("min_health", "central")
+        for algorithm in ("min_health", "central")
         for seed in range(6)
     ]
     one = named(claims.judge_all(runs), "min-health is above central", "standard")
@@ -158,7 +162,11 @@ def test_many_equal_runs_show_no_difference() -> None:
 
 def test_one_run_of_each_arm_on_six_tasks_is_a_sign_test() -> None:
     tasks = [*claims.STANDARD, *claims.WALKERS]
-    runs = [run(arm, task, 0, level) for task in tasks for arm, level in (("central", 0.9), ("local", 0.5))]
+    runs = [
+        run(algorithm, task, 0, level)
+        for task in tasks
+        for algorithm, level in (("central", 0.9), ("local", 0.5))
+    ]
     one = named(claims.judge_all(runs), "central is above local", suite="standard")
     assert one.found is not None
     assert one.found.chance == pytest.approx(2 / 2**6, abs=0.01)  # all six fall the same way, either way
@@ -171,9 +179,9 @@ def test_a_lead_that_grows_with_the_team() -> None:
     rng = np.random.default_rng(2)
     leads = {"hazard_nav-4": 0.0, "hazard_nav-8": 0.3, "hazard_comm-10": 0.1, "hazard_comm-16": 0.5}
     runs = [
-        run(arm, task, seed, 0.5 + (lead if arm == "min_health" else 0) + 0.01 * rng.normal())
+        run(algorithm, task, seed, 0.5 + (lead if algorithm == "min_health" else 0) + 0.01 * rng.normal())
         for task, lead in leads.items()
-        for arm in ("min_health", "central")
+        for algorithm in ("min_health", "central")
         for seed in range(5)
     ]
     one = named(claims.judge_all(runs), "lead over central grows", "standard")
@@ -186,9 +194,9 @@ def test_learning_first_and_then_no_more() -> None:
     share, rng = STEPS / STEPS[-1], np.random.default_rng(5)
     curves = {"local": 0.6 * (1 - np.exp(-20 * share)), "central": share}
     runs = [
-        run(arm, task, seed, score[-1], score + 0.02 * rng.normal(size=len(score)))
+        run(algorithm, task, seed, score[-1], score + 0.02 * rng.normal(size=len(score)))
         for task in claims.SUITES["paper"]
-        for arm, score in curves.items()
+        for algorithm, score in curves.items()
         for seed in range(4)
     ]
     judged = claims.judge_all(runs)
@@ -224,8 +232,8 @@ def worth(task: str, score: float) -> float:
     return anchors.random.mean + score * (anchors.reference.mean - anchors.random.mean)
 
 
-def write(agents: Path, arm: str, task: str, seed: int, rows, final=None) -> None:
-    place = agents / bundle_name(arm) / task
+def write(agents: Path, algorithm: str, task: str, seed: int, rows, final=None) -> None:
+    place = agents / bundle_name(algorithm) / task
     place.mkdir(parents=True, exist_ok=True)
     with (place / f"seed{seed}.curve.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, ["steps", "return", "eval_return"], restval="")
@@ -239,7 +247,7 @@ def write(agents: Path, arm: str, task: str, seed: int, rows, final=None) -> Non
 def agents(tmp_path: Path) -> Path:
     folder = tmp_path / "agents"
     rng = np.random.default_rng(0)
-    for arm, top in (("min_health", 0.8), ("central", 0.5), ("central-masked", 0.6)):
+    for algorithm, top in (("min_health", 0.8), ("central", 0.5), ("central-masked", 0.6)):
         for seed in range(4):
             rows = [
                 {
@@ -249,7 +257,7 @@ def agents(tmp_path: Path) -> Path:
                 }
                 for k in range(1, 21)
             ]
-            write(folder, arm, "paper_comm-10", seed, rows, final=top + 0.01 * rng.normal())
+            write(folder, algorithm, "paper_comm-10", seed, rows, final=top + 0.01 * rng.normal())
     return folder
 
 
@@ -259,22 +267,22 @@ def test_curves_come_from_trials_and_else_from_training(agents: Path) -> None:
     halfway = (low + high) / 2
     write(agents, "local", "hazard_nav-4", 7, [{"steps": 100 * k, "return": halfway} for k in range(1, 21)])
     found = traces(agents)
-    assert {(one.arm, one.task) for one in found} == {
+    assert {(one.algorithm, one.task) for one in found} == {
         ("min_health", "paper_comm-10"),
         ("central", "paper_comm-10"),
         ("central-masked", "paper_comm-10"),
         ("local", "hazard_nav-4"),
     }
-    (old,) = [one for one in found if one.arm == "local"]
+    (old,) = [one for one in found if one.algorithm == "local"]
     assert not old.tried
     assert old.seed == 7
     np.testing.assert_allclose(old.score, 0.5)
     assert old.final == pytest.approx(0.5), "without a measured score, the curve's end"
-    assert all(one.tried for one in found if one.arm != "local")
+    assert all(one.tried for one in found if one.algorithm != "local")
     # returns of a training that paid otherwise than the task are no scores
     record = agents / "mappo_local" / "hazard_nav-4" / "seed7.json"
     record.write_text(json.dumps({"settings": {"weights": {"alive": 0.1}}}))
-    assert "local" not in {one.arm for one in traces(agents)}
+    assert "local" not in {one.algorithm for one in traces(agents)}
 
 
 def test_runs_of_a_task_are_compared_by_one_measurement(agents: Path) -> None:
@@ -329,5 +337,5 @@ def test_every_task_and_arm_that_is_named_exists() -> None:
     shown = {task for panels in FAMILIES.values() for task in panels}
     compared = {task for suite in claims.SUITES.values() for task in suite}
     assert shown | compared <= set(tasks())
-    assert len({bundle_name(arm) for arm in BUNDLES}) == 5
+    assert len({bundle_name(algorithm) for algorithm in BUNDLES}) == 5
     assert bundle_name("central-masked_batch") == "mappo_central_masked_batch"

@@ -63,7 +63,7 @@ def test_value_targets_are_those_of_a_plain_loop(bootstrap: bool, monkeypatch) -
     """Discounted rewards while a fork lives, and the critic's value of where it was left."""
     monkeypatch.setattr(module, "_LIFE", 6)
     settings = small(
-        gamma=0.9, lam=1.0, rollout=60, bootstrap_truncation=bootstrap
+        gamma=0.9, gae_lambda=1.0, rollout=60, bootstrap_truncation=bootstrap
     )  # beyond the horizon of 50
     trainer = Trainer(settings)
     trainer.roll_out()
@@ -136,4 +136,4 @@ def test_a_resumed_run_with_forks_is_the_same_run(tmp_path: Path) -> None:
 
 
 def test_a_local_critic_has_no_use_for_forks() -> None:
-    assert Trainer(small(arm="local")).forks is None
+    assert Trainer(small(algorithm="local")).forks is None

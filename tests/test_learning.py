@@ -33,7 +33,7 @@ def column(*values: float) -> torch.Tensor:
 
 
 def test_gae_by_hand() -> None:
-    # gamma = lam = 0.5; step 1 truncates, step 2 terminates
+    # gamma = gae_lambda = 0.5; step 1 truncates, step 2 terminates
     # delta0 = 1 + .5*2 - 1   = 1     next_value[0] = V(s1) = 2
     # delta1 = 1 + .5*4 - 2   = 1     truncation bootstraps from the final state's V = 4
     # delta2 = 1 + 0    - 3   = -2    termination does not
@@ -45,7 +45,7 @@ def test_gae_by_hand() -> None:
         terminated=column(0, 0, 1).bool(),
         done=column(0, 1, 1).bool(),
         gamma=0.5,
-        lam=0.5,
+        gae_lambda=0.5,
     )
     torch.testing.assert_close(advantage, column(1.25, 1, -2))
 
@@ -180,9 +180,9 @@ def test_running_norm_treats_slots_alike() -> None:
     np.testing.assert_allclose(norm.offset[0], together[:, 0].mean(), atol=1e-3)
 
 
-@pytest.mark.parametrize("attends", [(), ("point", "neighbor"), ("neighbor",)])
-def test_numpy_policy_is_the_torch_actor(attends: tuple[str, ...], tmp_path: Path) -> None:
-    trainer = Trainer(recommended("hazard_nav-4", attends=attends, **SMALL))
+@pytest.mark.parametrize("attention_groups", [(), ("point", "neighbor"), ("neighbor",)])
+def test_numpy_policy_is_the_torch_actor(attention_groups: tuple[str, ...], tmp_path: Path) -> None:
+    trainer = Trainer(recommended("hazard_nav-4", attention_groups=attention_groups, **SMALL))
     trainer.iterate()
     trainer.save_policy(tmp_path / "policy.safetensors")
     policy = load_network(tmp_path / "policy.safetensors")
@@ -222,9 +222,11 @@ def test_a_resumed_run_is_the_same_run(tmp_path: Path) -> None:
 def test_a_larger_team_starts_from_what_a_smaller_one_learned(tmp_path: Path) -> None:
     start = Path("agents/mappo_minhealth/hazard_comm-10/seed0.safetensors").resolve()
     teacher = load_network(start)
-    own = recommended("hazard_comm-16", num_envs=8, rollout=10, start=str(start), critic_hidden=(16,))
+    own = recommended(
+        "hazard_comm-16", num_envs=8, rollout=10, initial_policy=str(start), critic_hidden=(16,)
+    )
     trainer = Trainer(own)
-    trainer.start_from(start)
+    trainer.start_from_policy(start)
     observation = trainer.step.observation
     expected, _ = teacher.act(observation, None, trainer.step.info["alive"])
     mean = trainer.actor(torch.from_numpy(observation)).mean.detach().numpy()
@@ -236,7 +238,7 @@ def test_a_larger_team_starts_from_what_a_smaller_one_learned(tmp_path: Path) ->
 
 def test_a_start_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     other = Path("agents/mappo_minhealth/hazard_nav-8/seed0.safetensors").resolve()
-    settings = recommended("hazard_comm-16", num_envs=8, rollout=10, start=str(other))
+    settings = recommended("hazard_comm-16", num_envs=8, rollout=10, initial_policy=str(other))
     with pytest.raises(BundleError, match="a start must declare"):
         train(settings, tmp_path, command="test")
     assert not (tmp_path / "checkpoint.pt").exists()
@@ -315,7 +317,7 @@ def test_another_runs_folder_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("gamma", 1.5), ("arm", "min-health"), ("steps", 0), ("seed", 1000)]
+    ("field", "value"), [("gamma", 1.5), ("algorithm", "min-health"), ("steps", 0), ("seed", 1000)]
 )
 def test_settings_out_of_range_are_refused(field: str, value: object) -> None:
     with pytest.raises(SpecError, match=field):
@@ -330,9 +332,9 @@ def test_learning_pays_off_in_a_minute() -> None:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("arm", ["local", "central", "min_health"])
-def test_every_arm_and_preset_improves_both_networks(preset: str, arm: str) -> None:
-    trainer = Trainer(PRESETS[preset]("paper_nav-4", arm=arm, **SMALL))
+@pytest.mark.parametrize("algorithm", ["local", "central", "min_health"])
+def test_every_algorithm_and_preset_improves_both_networks(preset: str, algorithm: str) -> None:
+    trainer = Trainer(PRESETS[preset]("paper_nav-4", algorithm=algorithm, **SMALL))
     before = [p.detach().clone() for p in (*trainer.actor.parameters(), *trainer.critic.parameters())]
     log = trainer.iterate()
     assert all(np.isfinite(value) for name, value in log.items() if name != "first_death")
@@ -343,7 +345,7 @@ def test_every_arm_and_preset_improves_both_networks(preset: str, arm: str) -> N
 @pytest.mark.parametrize("spontaneous_deaths", [0.0, 5.0])
 def test_values_are_bootstrapped_from_what_a_step_led_to(spontaneous_deaths: float) -> None:
     """With lambda 0 a value target is r + gamma V(next), one world and step at a time."""
-    changes = {**SMALL, "rollout": 60, "lam": 0.0, "spontaneous_deaths": spontaneous_deaths}
+    changes = {**SMALL, "rollout": 60, "gae_lambda": 0.0, "spontaneous_deaths": spontaneous_deaths}
     trainer = Trainer(recommended("hazard_nav-4", **changes))
     steps, step = [], trainer.env.step
     trainer.env.step = lambda action: steps.append(step(action)) or steps[-1]
@@ -365,7 +367,7 @@ def test_values_are_bootstrapped_from_what_a_step_led_to(spontaneous_deaths: flo
 
 
 def test_a_local_critic_sees_one_agent_only() -> None:
-    trainer = Trainer(recommended("hazard_nav-4", arm="local", **SMALL))
+    trainer = Trainer(recommended("hazard_nav-4", algorithm="local", **SMALL))
     data = trainer.roll_out()
     target, _ = trainer.assign_credit(data)
     assert target.shape == (10, 8, 4)
@@ -381,7 +383,7 @@ def test_dead_samples_move_the_actor_only_where_they_are_not_masked() -> None:
     """What the dead are told to do (their stored actions) changes the update, or does not."""
     ends: dict[bool, list[torch.Tensor]] = {True: [], False: []}
     for masked, moved in ((masked, moved) for masked in ends for moved in (0.0, 0.5)):
-        trainer = Trainer(recommended("hazard_nav-4", arm="central", mask_dead=masked, **SMALL))
+        trainer = Trainer(recommended("hazard_nav-4", algorithm="central", mask_dead=masked, **SMALL))
         data = trainer.roll_out()
         data.health[:, :, 1] = 0.0
         target, psi = trainer.assign_credit(data)
@@ -393,14 +395,14 @@ def test_dead_samples_move_the_actor_only_where_they_are_not_masked() -> None:
 
 
 def test_the_papers_quirks_are_in_its_preset() -> None:
-    settings = paper("paper_nav-8", arm="central")
+    settings = paper("paper_nav-8", algorithm="central")
     # facts sheet, section 5: 50,000 episodes of 50 steps, 256 a batch, 8 epochs, 8 minibatches
     assert settings.steps == 50_000 * 50
     assert settings.num_envs * settings.rollout == 256 * 50
     assert (settings.epochs, settings.minibatches, settings.value_clip) == (8, 8, 0.2)
     assert not settings.mask_dead
     assert not settings.bootstrap_truncation
-    trainer = Trainer(paper("paper_nav-8", arm="local", num_envs=4))
+    trainer = Trainer(paper("paper_nav-8", algorithm="local", num_envs=4))
     data = trainer.roll_out()
     trainer.assign_credit(data)
     assert (trainer.actor.norm.scale == 1).all()
@@ -411,3 +413,9 @@ def test_the_papers_quirks_are_in_its_preset() -> None:
 def test_fast_tanh_is_tanh() -> None:
     x = torch.linspace(-12, 12, 1001)
     torch.testing.assert_close(Tanh()(x), torch.tanh(x), atol=2e-7, rtol=0)
+
+
+@pytest.mark.parametrize(("theirs", "ours"), [("mappo", "central"), ("ippo", "local")])
+def test_the_fields_names_of_algorithms_are_understood(theirs: str, ours: str) -> None:
+    for preset in PRESETS.values():
+        assert preset("hazard_nav-4", algorithm=theirs) == preset("hazard_nav-4", algorithm=ours)

@@ -111,7 +111,7 @@ def test_own_task_trained_evaluated_calibrated(tmp_path):
 
 
 def test_a_run_and_a_policy_file_are_agents(tmp_path):
-    run("train", "--task", "coop_nav-3", *SMALL, "--seed", 7, "--out", "a run", "--set", "std=0.4")
+    run("train", "--task", "coop_nav-3", *SMALL, "--seed", 7, "--out", "a run", "--set", "initial_std=0.4")
     agent = find_agent("a run")
     assert (agent.name, agent.tasks, agent.train_seeds("coop_nav-3")) == ("a_run", ("coop_nav-3",), (7,))
     alone = find_agent("a run/policy.safetensors")

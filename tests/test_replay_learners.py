@@ -14,7 +14,7 @@ from hipg_bench.errors import HipgError, ResumeError, SpecError
 from hipg_bench.learning import maddpg, qmix
 from hipg_bench.learning.replay import Replay
 from hipg_bench.learning.run import Learner, new_learner, train
-from hipg_bench.learning.settings import ARMS, paper, recommended
+from hipg_bench.learning.settings import ALGORITHMS, paper, recommended
 from hipg_bench.paths import LOCK
 from hipg_bench.policies.network import load_network
 
@@ -23,21 +23,21 @@ SMALL = {
     "learning_starts": 100, "update_every": 40,
 }  # fmt: skip
 DEADLY = "hazard_nav-4"
-ARM = {"maddpg": maddpg.Trainer, "qmix": qmix.Trainer}
+ALGORITHM = {"maddpg": maddpg.Trainer, "qmix": qmix.Trainer}
 
 
-@pytest.fixture(params=ARM)
-def arm(request):
+@pytest.fixture(params=ALGORITHM)
+def algorithm(request):
     return request.param
 
 
-def small(arm, task=DEADLY, **changes):
-    return recommended(task, arm=arm, **{**SMALL, **changes})
+def small(algorithm, task=DEADLY, **changes):
+    return recommended(task, algorithm=algorithm, **{**SMALL, **changes})
 
 
-def trained(arm, folder, **changes):
+def trained(algorithm, folder, **changes):
     """A learner whose targets have parted from its networks, and a sample with every kind of ending."""
-    trainer = ARM[arm](small(arm, target_share=0.3, **changes), folder)
+    trainer = ALGORITHM[algorithm](small(algorithm, tau=0.3, **changes), folder)
     trainer.iterate()
     trainer.iterate()
     assert trainer.updates > 0
@@ -187,7 +187,7 @@ def maddpg_by_hand(trainer, batch):
 
 
 def test_maddpg_losses_against_a_loop_over_agents(tmp_path: Path) -> None:
-    trainer, batch = trained("maddpg", tmp_path, critic_hidden=(16,), saturation=0.0, max_grad_norm=1e9)
+    trainer, batch = trained("maddpg", tmp_path, critic_hidden=(16,), pretanh_l2=0.0, max_grad_norm=1e9)
     value_loss, actor_loss = maddpg_by_hand(trainer, batch)
     actor = list(trainer.loss.actor_network_params.parameters())
     expected = torch.autograd.grad(actor_loss, actor)
@@ -262,13 +262,15 @@ def test_qmix_loss_against_a_loop_over_samples(tmp_path: Path) -> None:
     assert trainer.improve(batch)["value_loss"] == pytest.approx(np.mean(np.square(errors)), rel=1e-3)
 
 
-def test_the_policy_file_is_what_acts(arm, tmp_path: Path) -> None:
-    trainer = ARM[arm](small(arm, **({"reach": 3.0} if arm == "maddpg" else {})), tmp_path)
+def test_the_policy_file_is_what_acts(algorithm, tmp_path: Path) -> None:
+    trainer = ALGORITHM[algorithm](
+        small(algorithm, **({"action_scale": 3.0} if algorithm == "maddpg" else {})), tmp_path
+    )
     for _ in range(3):
         trainer.iterate()
     trainer.save_policy(tmp_path / "policy.safetensors")
     policy = load_network(tmp_path / "policy.safetensors")
-    assert policy.num_agents == (4 if arm == "maddpg" else None)
+    assert policy.num_agents == (4 if algorithm == "maddpg" else None)
     observation, alive = trainer.step.observation, trainer.step.info["alive"]
     action, _ = policy.act(observation, None, alive)
     trainer.exploration.sigma = trainer.exploration.eps = torch.tensor(0.0)  # one of them is its own
@@ -278,19 +280,19 @@ def test_the_policy_file_is_what_acts(arm, tmp_path: Path) -> None:
     assert np.abs(action).max() <= trainer.form.reach
 
 
-def test_what_the_dead_are_told_counts_only_where_they_are_not_masked(arm, tmp_path: Path) -> None:
+def test_what_the_dead_are_told_counts_only_where_they_are_not_masked(algorithm, tmp_path: Path) -> None:
     ends = {True: [], False: []}
     for masked in ends:
         for moved in (0, 1):
             folder = tmp_path / f"{masked}{moved}"
-            trainer = ARM[arm](small(arm, mask_dead=masked), folder)
+            trainer = ALGORITHM[algorithm](small(algorithm, mask_dead=masked), folder)
             for _ in range(2):
                 trainer.iterate()
             alive = torch.ones(32, 4, dtype=torch.bool)
             alive[:, 1] = False
             batch = trainer._sample()
             batch["acting"] = trainer._acting(alive)
-            if arm == "qmix":
+            if algorithm == "qmix":
                 batch["action"][:, 1] = moved
             else:
                 batch["action"][:, 1] = (
@@ -301,7 +303,7 @@ def test_what_the_dead_are_told_counts_only_where_they_are_not_masked(arm, tmp_p
             trainer.improve(batch)
             after = [p.detach().clone() for p in trainer.body.parameters()]
             assert any((a != b).any() for a, b in zip(before, after, strict=True))
-            if arm == "maddpg" and masked:
+            if algorithm == "maddpg" and masked:
                 # earlier gradients go on in Adam, so that only the new one is looked at
                 assert all((p.grad[1] == 0).all() for p in trainer.body.parameters())
             ends[masked].append(torch.cat([p.flatten() for p in after]))
@@ -309,10 +311,12 @@ def test_what_the_dead_are_told_counts_only_where_they_are_not_masked(arm, tmp_p
     assert not torch.equal(*ends[False])
 
 
-def test_dead_agents_steps_stay_with_zeros_for_actions(arm, tmp_path: Path) -> None:
+def test_dead_agents_steps_stay_with_zeros_for_actions(algorithm, tmp_path: Path) -> None:
     from hipg_bench.registry import make
 
-    trainer = ARM[arm](small(arm, learning_starts=10_000, buffer=10_000, mask_dead=False), tmp_path)
+    trainer = ALGORITHM[algorithm](
+        small(algorithm, learning_starts=10_000, buffer=10_000, mask_dead=False), tmp_path
+    )
     trainer.env = make(DEADLY, 8, 0, hazard_peak=0.9, hazard_radius=2.0, threads=1)
     trainer.step = trainer.env.reset()
     trainer.iterate()
@@ -331,8 +335,8 @@ class KilledError(Exception):
     pass
 
 
-def test_a_killed_run_is_the_same_run(arm, tmp_path: Path) -> None:
-    settings = small(arm)
+def test_a_killed_run_is_the_same_run(algorithm, tmp_path: Path) -> None:
+    settings = small(algorithm)
     train(settings, tmp_path / "whole", command="test")
 
     def kill(iteration, log):
@@ -350,8 +354,8 @@ def test_a_killed_run_is_the_same_run(arm, tmp_path: Path) -> None:
         assert {**a, "seconds": ""} == {**b, "seconds": ""}
 
 
-def test_a_finished_run_is_left_alone_and_gives_its_disk_back(arm, tmp_path: Path) -> None:
-    settings = small(arm, steps=240)
+def test_a_finished_run_is_left_alone_and_gives_its_disk_back(algorithm, tmp_path: Path) -> None:
+    settings = small(algorithm, steps=240)
     train(settings, tmp_path, command="test")
     before = (tmp_path / "policy.safetensors").read_bytes()
     train(settings, tmp_path, command="test")
@@ -361,43 +365,47 @@ def test_a_finished_run_is_left_alone_and_gives_its_disk_back(arm, tmp_path: Pat
         ".checkpoint.pt.sha256", ".curve.csv.sha256",
     }  # fmt: skip
     with pytest.raises(ResumeError, match="replay"):
-        train(small(arm, steps=480), tmp_path, command="test")
+        train(small(algorithm, steps=480), tmp_path, command="test")
     with pytest.raises(ResumeError, match="gamma"):
-        train(small(arm, steps=240, gamma=0.5), tmp_path, command="test")
-    with pytest.raises(ResumeError, match="arm"):
-        train(small({"maddpg": "qmix", "qmix": "maddpg"}[arm], steps=240), tmp_path, command="test")
+        train(small(algorithm, steps=240, gamma=0.5), tmp_path, command="test")
+    with pytest.raises(ResumeError, match="algorithm"):
+        train(small({"maddpg": "qmix", "qmix": "maddpg"}[algorithm], steps=240), tmp_path, command="test")
 
 
-def test_every_arm_is_a_learner(tmp_path: Path) -> None:
-    for name in ARMS:
-        changes = {} if name not in ARM else SMALL
-        assert isinstance(new_learner(recommended(DEADLY, arm=name, **changes), tmp_path / name), Learner)
+def test_every_algorithm_is_a_learner(tmp_path: Path) -> None:
+    for name in ALGORITHMS:
+        changes = {} if name not in ALGORITHM else SMALL
+        assert isinstance(
+            new_learner(recommended(DEADLY, algorithm=name, **changes), tmp_path / name), Learner
+        )
 
 
 def test_a_buffer_beyond_the_disk_is_refused(tmp_path: Path) -> None:
     with pytest.raises(HipgError, match=r"GB.*--set buffer"):
-        maddpg.Trainer(recommended("hazard_comm-16", arm="maddpg", buffer=100_000_000), tmp_path)
+        maddpg.Trainer(recommended("hazard_comm-16", algorithm="maddpg", buffer=100_000_000), tmp_path)
 
 
 def test_the_authors_maddpg_is_the_papers_preset() -> None:
-    settings = paper("paper_nav-8", arm="maddpg")
+    settings = paper("paper_nav-8", algorithm="maddpg")
     # facts sheet, section 5
     assert (settings.batch, settings.buffer, settings.learning_starts) == (1024, 1_000_000, 51_200)
-    assert (settings.update_every, settings.target_share, settings.max_grad_norm) == (100, 0.01, 0.5)
+    assert (settings.update_every, settings.tau, settings.max_grad_norm) == (100, 0.01, 0.5)
     assert (settings.gamma, settings.hidden, settings.critic_hidden) == (0.95, (64, 64), (64, 64))
-    assert (settings.reach, settings.critic_sees, settings.mask_dead) == (5.0, "observations", False)
-    assert paper("multiwalker_planar-3", arm="maddpg").reach == 1.0, "a task that clips has no use for more"
-    assert paper("multiwalker_planar-3", arm="qmix").bins == 8
+    assert (settings.action_scale, settings.critic_sees, settings.mask_dead) == (5.0, "observations", False)
+    assert paper("multiwalker_planar-3", algorithm="maddpg").action_scale == 1.0, (
+        "a task that clips has no use for more"
+    )
+    assert paper("multiwalker_planar-3", algorithm="qmix").bins == 8
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"arm": "maddpg", "epochs": 3}, "no field 'epochs'"),
-        ({"arm": "qmix", "bins": 1}, "bins = 1"),
-        ({"arm": "maddpg", "noise_left": 1.5}, "noise_left = 1.5"),
-        ({"arm": "maddpg", "hidden": ()}, "hidden"),
-        ({"arm": "qmixx"}, "no arm 'qmixx'; did you mean 'qmix'?"),
+        ({"algorithm": "maddpg", "epochs": 3}, "no field 'epochs'"),
+        ({"algorithm": "qmix", "bins": 1}, "bins = 1"),
+        ({"algorithm": "maddpg", "final_noise": 1.5}, "final_noise = 1.5"),
+        ({"algorithm": "maddpg", "hidden": ()}, "hidden"),
+        ({"algorithm": "qmixx"}, "no algorithm 'qmixx'; did you mean 'qmix'?"),
     ],
 )
 def test_wrong_settings_are_refused(changes, message) -> None:
@@ -415,7 +423,7 @@ assert "torchrl" not in sys.modules and "tensordict" not in sys.modules
 sys.modules["torchrl"] = sys.modules["tensordict"] = None
 from pathlib import Path
 new_learner(recommended({DEADLY!r}, num_envs=2), Path({str(tmp_path)!r}))
-new_learner(recommended({DEADLY!r}, arm="qmix"), Path({str(tmp_path)!r}))
+new_learner(recommended({DEADLY!r}, algorithm="qmix"), Path({str(tmp_path)!r}))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert "HipgError: arm 'qmix' needs TorchRL: pip install 'hipg-bench[torchrl]'" in done.stderr
+    assert "HipgError: algorithm 'qmix' needs TorchRL: pip install 'hipg-bench[torchrl]'" in done.stderr

@@ -26,7 +26,7 @@ ROOT = Path(hipg_bench.__file__).resolve().parents[1]
 SWEEP = """
 [[run]]
 tasks = ["coop_nav-3"]
-arms = ["central", "local"]
+algorithms = ["central", "local"]
 seeds = [0, 1]
 settings = { num_envs = 4, rollout = 5, steps = 40, actor_hidden = [8], critic_hidden = [8] }
 """
@@ -42,7 +42,7 @@ def wait_until(happened: Callable[[], bool]) -> None:
 def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "sweep.toml").write_text(SWEEP)
     runs = sweep.load(tmp_path / "sweep.toml", tmp_path / "out")
-    assert [(run.settings.arm, run.settings.seed) for run in runs] == [
+    assert [(run.settings.algorithm, run.settings.seed) for run in runs] == [
         ("central", 0), ("local", 0), ("central", 1), ("local", 1)
     ]  # fmt: skip
     done_before = runs[0]
@@ -52,7 +52,7 @@ def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Pat
     assert seen[-1] == 4
     records = [json.loads((run.out / "train.json").read_text()) for run in runs]
     assert records[0]["command"] == "by hand", "a finished run is left alone"
-    assert "--arm local" in records[1]["command"]
+    assert "--algorithm local" in records[1]["command"]
     # one thread or a process of its own: the same run
     train(runs[1].settings, tmp_path / "again", command="by hand")
     assert (tmp_path / "again" / "policy.safetensors").read_bytes() == (
@@ -115,20 +115,23 @@ def test_the_sweeps_that_come_along_are_what_the_comparison_needs(tmp_path: Path
     folder = Path(__file__).parent.parent / "sweeps"
     runs = {path.stem: sweep.load(path, tmp_path) for path in folder.glob("*.toml")}
     seeds = {
-        name: Counter((run.settings.task, run.arm) for run in sweep_runs) for name, sweep_runs in runs.items()
+        name: Counter((run.settings.task, run.algorithm) for run in sweep_runs)
+        for name, sweep_runs in runs.items()
     }
-    arms = ("min_health", "central", "local")
+    algorithms = ("min_health", "central", "local")
     for task in tagged("standard"):
         wanted = 3 if task.startswith("multiwalker") else 5
-        assert all(seeds["standard"][task, arm] >= wanted for arm in arms), task
+        assert all(seeds["standard"][task, algorithm] >= wanted for algorithm in algorithms), task
     for task in tagged("paper"):
-        assert all(seeds["paper"][task, arm] >= 4 for arm in arms), task
+        assert all(seeds["paper"][task, algorithm] >= 4 for algorithm in algorithms), task
         assert seeds["paper"][task, "maddpg"] >= 2, task
-    assert all(seeds["planar"]["multiwalker_planar-3", arm] for arm in (*arms, "maddpg", "qmix"))
+    assert all(
+        seeds["planar"]["multiwalker_planar-3", algorithm] for algorithm in (*algorithms, "maddpg", "qmix")
+    )
     # one step of the chain at a time: mask, normalisation, baseline
     chain = [
-        next(run.settings for run in runs[name] if (run.settings.task, run.arm) == ("paper_comm-10", arm))
-        for name, arm in [
+        next(r.settings for r in runs[name] if (r.settings.task, r.algorithm) == ("paper_comm-10", key))
+        for name, key in [
             ("paper", "central"), ("masking", "central-masked"), ("masking", "central-masked_batch"),
             ("masking", "min_health-masked"), ("paper", "min_health"),
         ]
@@ -137,14 +140,14 @@ def test_the_sweeps_that_come_along_are_what_the_comparison_needs(tmp_path: Path
         {key for key, value in before.model_dump().items() if getattr(after, key) != value}
         for before, after in itertools.pairwise(chain)
     ]
-    assert steps == [{"mask_dead"}, {"psi_over"}, {"arm"}, {"mask_dead"}]
+    assert steps == [{"mask_dead"}, {"advantage_norm"}, {"algorithm"}, {"mask_dead"}]
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         (SWEEP + SWEEP, "label"),
-        (SWEEP.replace("central", "centrl"), "arm"),
+        (SWEEP.replace("central", "centrl"), "algorithm"),
         (SWEEP.replace("seeds", "seds"), r"run\.0\.seds"),
         ("run = 3 =", "not TOML"),
     ],

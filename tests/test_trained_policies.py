@@ -67,7 +67,7 @@ def test_the_first_minibatchs_ratio_is_one(task, warm, tmp_path):
         size = trainer.env.observation_size
         other.actor.norm.adopt(torch.full((size,), 3.0), torch.full((size,), 0.2), 1000)
         other.save_policy(tmp_path / "start.safetensors")
-        trainer.start_from(tmp_path / "start.safetensors")
+        trainer.start_from_policy(tmp_path / "start.safetensors")
     trainer.iterate()
     data = trainer.roll_out()
     trainer.assign_credit(data)
@@ -85,7 +85,7 @@ def test_entropy_follows_its_target():
     for trainer, factor in ((low, 1 / 1.1), (high, 1.1)):
         for _ in range(3):
             log = trainer.iterate()
-        assert log["entropy_weight"] == pytest.approx(0.01 * factor**3)
+        assert log["entropy_coef"] == pytest.approx(0.01 * factor**3)
 
 
 def test_the_entropy_bonus_is_in_the_checkpoint(tmp_path):
@@ -94,7 +94,7 @@ def test_the_entropy_bonus_is_in_the_checkpoint(tmp_path):
     trainer.save(tmp_path / "checkpoint.pt")
     other = small_trainer("paper_nav-4", target_entropy=3.0)
     other.resume(tmp_path / "checkpoint.pt")
-    assert other.entropy_weight == trainer.entropy_weight == pytest.approx(0.011)
+    assert other.entropy_coef == trainer.entropy_coef == pytest.approx(0.011)
 
 
 def test_training_computes_in_single_precision_on_every_processor():

@@ -46,14 +46,14 @@ def audit(
     found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=luck)
     noise = gradient_noise(actor, critic, settings, worlds=_NOISE_WORLDS * worlds, seed=luck)
     if plot is not None:
-        audits.draw(found, plot, title=f"{settings.task}, {settings.arm}, seed {settings.seed}")
+        audits.draw(found, plot, title=f"{settings.task}, {settings.algorithm}, seed {settings.seed}")
     if as_json:
         console.show_json(
             _facts(found)
             | {"gradient": dataclasses.asdict(noise), "run": str(source), "settings": settings.model_dump()}
         )
         return
-    _print(found, f"{settings.task}, arm {settings.arm}, training seed {settings.seed}")
+    _print(found, f"{settings.task}, algorithm {settings.algorithm}, training seed {settings.seed}")
     _print_noise(noise)
 
 

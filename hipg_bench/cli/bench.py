@@ -52,7 +52,7 @@ _COLUMNS: Mapping[str, dict[str, str]] = {
     },
     "train": {
         "task": "{task}",
-        "arm": "{arm}",
+        "algorithm": "{algorithm}",
         ">threads": "{threads}",
         ">worlds x steps": "{num_envs} x {rollout}",
         ">s per iteration": "{seconds:.2f}",

@@ -31,8 +31,14 @@ def train(
         str | None, typer.Option(help="A task's name or a task file (.toml).", autocompletion=complete_task)
     ] = None,
     num_agents: NumAgentsOption = None,
-    arm: Annotated[
-        str, typer.Option(help="MAPPO by its credit: min_health, central, local; or maddpg, qmix.")
+    algorithm: Annotated[
+        str,
+        typer.Option(
+            "--algorithm",
+            "--algo",
+            help="MAPPO with one of the credit rules min_health, central (also called mappo) or local "
+            "(also called ippo); or maddpg, or qmix.",
+        ),
     ] = "min_health",
     preset: Annotated[
         str, typer.Option(help="Settings to start from: recommended or paper.")
@@ -51,7 +57,8 @@ def train(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of the run, by default runs/TASK-ARM-seedK. An unfinished run in it is resumed."
+            help="Folder of the run, by default runs/TASK-ALGORITHM-seedK. "
+            "An unfinished run in it is resumed."
         ),
     ] = None,
     threads: Annotated[
@@ -82,27 +89,30 @@ def train(
 
     import torch
 
-    from hipg_bench.learning.settings import ARMS, PRESETS
+    from hipg_bench.learning.settings import ALGORITHMS, PRESETS, SYNONYMS
 
     torch.set_num_threads(threads)
     if preset not in PRESETS:
         raise SpecError(f"no preset {preset!r}{hint(preset, PRESETS)}")
-    if arm not in ARMS:
-        raise SpecError(f"no arm {arm!r}{hint(arm, ARMS)}")
-    pairs = [pair for pair in setting or [] if pair.partition("=")[0] not in ARMS[arm].model_fields]
-    spec = _task(str(task), num_agents, pairs, ARMS[arm].model_fields)
+    algorithm = SYNONYMS.get(algorithm, algorithm)
+    if algorithm not in ALGORITHMS:
+        raise SpecError(f"no algorithm {algorithm!r}{hint(algorithm, ALGORITHMS)}")
+    pairs = [
+        pair for pair in setting or [] if pair.partition("=")[0] not in ALGORITHMS[algorithm].model_fields
+    ]
+    spec = _task(str(task), num_agents, pairs, ALGORITHMS[algorithm].model_fields)
     own = [pair for pair in setting or [] if pair not in pairs]
-    changes: dict[str, Any] = {"arm": arm, "seed": seed, **parse_pairs(own)}
+    changes: dict[str, Any] = {"algorithm": algorithm, "seed": seed, **parse_pairs(own)}
     if steps is not None:
         changes["steps"] = steps
     settings = PRESETS[preset](spec.task, **changes)
     folder = out or Path("runs") / "-".join(
-        [spec.task, arm, *([preset] if preset != "recommended" else []), f"seed{seed}"]
+        [spec.task, algorithm, *([preset] if preset != "recommended" else []), f"seed{seed}"]
     )
     options = [
         f"--task {quoted(str(task))}",
         *([] if num_agents is None else [f"--num-agents {num_agents}"]),
-        f"--arm {arm}",
+        f"--algorithm {algorithm}",
         f"--preset {preset}",
         f"--seed {seed}",
         *(f"--set {quoted(pair)}" for pair in setting or []),
@@ -138,7 +148,7 @@ def _train_one(settings: AnySettings, out: Path, command: str, track: tuple[str,
         _print_result(settings, out)
         return
     console.say(
-        f"{settings.task}, arm {settings.arm}, seed {settings.seed}: "
+        f"{settings.task}, algorithm {settings.algorithm}, seed {settings.seed}: "
         f"{settings.steps:,} environment steps into {out}"
     )
     with console.progress() as bars:
@@ -217,12 +227,14 @@ def _tell(sweep: Path, out: Path, workers: int) -> None:
     from hipg_bench.learning.sweep import load, standings
 
     found = standings(load(sweep, out), time.time())
-    rows = console.table("task", "arm", ">seed", "state", ">steps", ">minutes", ">left", title=sweep.name)
+    rows = console.table(
+        "task", "algorithm", ">seed", "state", ">steps", ">minutes", ">left", title=sweep.name
+    )
     for one in found:
         settings = one.run.settings
         rows.add_row(
             settings.task,
-            one.run.arm,
+            one.run.algorithm,
             str(settings.seed),
             one.state,
             f"{one.steps:,} / {settings.steps:,}",

@@ -1,12 +1,12 @@
 """Finished runs become bundles: weights, record, learning curve and score of every training seed.
 
-A run with seed k of an arm on a task comes to lie in ``<agents>/<bundle>/<task>/``:
+A run with seed k of an algorithm on a task comes to lie in ``<agents>/<bundle>/<task>/``:
 
     seed<k>.safetensors          the last policy, whatever the trials said of earlier ones
     seed<k>.json                 the run's record, and its score by the standard protocol
     seed<k>.curve.csv            raw rows of the learning curve, at most `MOST_ROWS`
     seed<k>.learner.safetensors  the networks an audit needs; of seed 0 only, to bound the size
-    seed<k>.start.safetensors    the policy that the run began with, if it began with one
+    seed<k>.initial.safetensors    the policy that the run began with, if it began with one
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BUNDLES = {
     "maddpg": "maddpg",
     "qmix": "qmix",
 }
-"""Arm to the name of its bundle."""
+"""Algorithm to the name of its bundle."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,9 +60,9 @@ class Collected:
     state: Literal["new", "there", "kept", "unfinished", "stale"]
 
 
-def bundle_name(arm: str) -> str:
-    """The bundle of an arm, or of an arm with a label: ``central-masked`` is in ``mappo_central_masked``."""
-    plain, _, label = arm.partition("-")
+def bundle_name(algorithm: str) -> str:
+    """The bundle of an algorithm, perhaps with a label: ``central-masked`` is in ``mappo_central_masked``."""
+    plain, _, label = algorithm.partition("-")
     return BUNDLES[plain] + (f"_{label}" if label else "")
 
 
@@ -82,7 +82,7 @@ def collect(
     """
     touched: set[Path] = set()
     for run in runs:
-        folder = agents / bundle_name(run.arm)
+        folder = agents / bundle_name(run.algorithm)
         state = _state(run, folder, replace)
         if state == "new":
             _add(run, folder, plan or Plan())
@@ -136,7 +136,7 @@ def _add(run: Run, folder: Path, plan: Plan) -> None:
     if record is None or not policy.exists():
         raise BundleError(f"{run.out} holds no finished run")
     if not (folder / "agent.toml").exists():
-        write_text(folder / "agent.toml", card_text(run.arm, folder.name))
+        write_text(folder / "agent.toml", card_text(run.algorithm, folder.name))
     rows = plan.play_all(task_spec(settings.task), load_network(policy))
     write_text(
         place.with_suffix(".json"),
@@ -144,8 +144,8 @@ def _add(run: Run, folder: Path, plan: Plan) -> None:
         + "\n",
     )
     write_text(place.with_suffix(".curve.csv"), _thinned_text((run.out / "curve.csv").read_text()))
-    if "start_fingerprint" in record:
-        _copy(_start(run, record), place.with_suffix(".start.safetensors"))
+    if "initial_policy_fingerprint" in record:
+        _copy(_start(run, record), place.with_suffix(".initial.safetensors"))
     learner = run.out / "learner.safetensors"
     if settings.seed == 0 and learner.exists():
         _copy(learner, place.with_suffix(".learner.safetensors"))
@@ -154,9 +154,9 @@ def _add(run: Run, folder: Path, plan: Plan) -> None:
 
 def _start(run: Run, record: dict[str, Any]) -> Path:
     """The policy that a run began with, without which nobody can repeat it."""
-    path = Path(record["settings"]["start"])
+    path = Path(record["settings"]["initial_policy"])
     fingerprint = hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
-    if not fingerprint.startswith(record["start_fingerprint"]):
+    if not fingerprint.startswith(record["initial_policy_fingerprint"]):
         raise BundleError(f"{run.out} began with {path}, which is gone or has changed since")
     return path
 

@@ -21,9 +21,9 @@ _SUMMARIES = {
 }
 
 
-def card_text(arm: str, name: str) -> str:
-    """An ``agent.toml`` for an arm, perhaps with a label."""
-    plain, _, label = arm.partition("-")
+def card_text(algorithm: str, name: str) -> str:
+    """An ``agent.toml`` for an algorithm, perhaps with a label."""
+    plain, _, label = algorithm.partition("-")
     summary = _SUMMARIES[plain] + (f"; variant {label}, see sweeps/" if label else "")
     return f'name = "{name}"\nsummary = "{summary}"\nkind = "network"\nlicense = "Apache-2.0"\n'
 
@@ -60,7 +60,7 @@ def _section(task: str, records: dict[int, dict[str, Any]]) -> list[str]:
     first = next(iter(records.values()))
     command = re.sub(r"--seed \d+", "--seed K", first["command"])
     command = re.sub(r"--out \S+", "--out DIR", command)
-    command = re.sub(r'start="[^"]*"', f'start="{task}/seedK.start.safetensors"', command)
+    command = re.sub(r'initial_policy="[^"]*"', f'initial_policy="{task}/seedK.initial.safetensors"', command)
     return [
         f"## {task}",
         f"{mean}Trained with `{command}`.",

@@ -1,19 +1,19 @@
 """The paper's claims, each as a comparison of two samples of runs, and the rule by which it is judged.
 
-A claim says that values x are above values y: final scores of two arms, gains over a part of the training.
-It **holds** if the 95 % interval of P(improvement) lies above 1/2 and the permutation test is below 0.05; it
-**does not hold** if the interval lies below 1/2 and the test is below 0.05. There is **no difference** if the
-90 % interval lies within 1/2 +- 0.1, the equivalence test of two one-sided tests at 0.05, and each task has
-five runs of both sides, since the interval of fewer says nothing; else it is **undecided**. Tasks where one
-side has no run are left out, and so are runs that began with another run's policy. There is no correction for
-the number of claims: about one in twenty would pass by luck.
+A claim says that values x are above values y: final scores of two algorithms, gains over a part of the
+training. It **holds** if the 95 % interval of P(improvement) lies above 1/2 and the permutation test is below
+0.05; it **does not hold** if the interval lies below 1/2 and the test is below 0.05. There is **no
+difference** if the 90 % interval lies within 1/2 +- 0.1, the equivalence test of two one-sided tests at 0.05,
+and each task has five runs of both sides, since the interval of fewer says nothing; else it is **undecided**.
+Tasks where one side has no run are left out, and so are runs that began with another run's policy. There is
+no correction for the number of claims: about one in twenty would pass by luck.
 
-Pooling over tasks hides an arm that is better on one and worse on another, so each task has a verdict of its
-own, by the same rule, with Holm's correction (1979) for the number of tasks in the claim.
+Pooling over tasks hides an algorithm that is better on one and worse on another, so each task has a verdict
+of its own, by the same rule, with Holm's correction (1979) for the number of tasks in the claim.
 
-How far an arm's runs lie apart is not compared: for five runs a side the usual tests find a twofold spread in
-a fifth of all cases, and the median's own run, whose distance is 0 for odd numbers, must be left out (Hines
-and Hines 2000).
+How far an algorithm's runs lie apart is not compared: for five runs a side the usual tests find a twofold
+spread in a fifth of all cases, and the median's own run, whose distance is 0 for odd numbers, must be left
+out (Hines and Hines 2000).
 """
 
 from __future__ import annotations
@@ -100,23 +100,29 @@ def judge_all(runs: Runs) -> list[Judged]:
 def _judge_suite(suite: str, runs: Runs) -> list[Judged]:
     hazard, harmless = SUITES[suite], _HARMLESS[suite]
 
-    def arms(
+    def algorithms(
         better: str, worse: str, of: Callable[[Runs], Values], tasks: Sequence[str]
     ) -> dict[str, Stratum]:
         return {task: (of(_of(runs, better, task)), of(_of(runs, worse, task))) for task in tasks}
 
     compared: list[tuple[str, dict[str, Stratum]]] = [
-        ("min-health is above central", arms("min_health", "central", finals, hazard)),
-        ("central is above local", arms("central", "local", finals, hazard)),
-        ("local is above MADDPG", arms("local", "maddpg", finals, hazard)),
+        ("min-health is above central", algorithms("min_health", "central", finals, hazard)),
+        ("central is above local", algorithms("central", "local", finals, hazard)),
+        ("local is above MADDPG", algorithms("local", "maddpg", finals, hazard)),
         ("min-health's lead over central grows with the team", _growth(runs, _GROWING[suite])),
         (
             "local learns first: above central in the first fifth",
-            arms("local", "central", early, hazard),
+            algorithms("local", "central", early, hazard),
         ),
-        ("local plateaus: central gains more after half-time", arms("central", "local", late_gains, hazard)),
-        ("QMIX fails: local is above it", arms("local", "qmix", finals, hazard)),
-        ("without hazard: central is above min-health", arms("central", "min_health", finals, harmless)),
+        (
+            "local plateaus: central gains more after half-time",
+            algorithms("central", "local", late_gains, hazard),
+        ),
+        ("QMIX fails: local is above it", algorithms("local", "qmix", finals, hazard)),
+        (
+            "without hazard: central is above min-health",
+            algorithms("central", "min_health", finals, harmless),
+        ),
     ]
     return [_judged(claim, suite, strata) for claim, strata in compared]
 
@@ -153,7 +159,7 @@ def _growth(runs: Runs, pairs: Sequence[tuple[str, str]]) -> dict[str, Stratum]:
 
 def _leads(runs: Runs, task: str) -> Values:
     ours, theirs = (
-        {run.seed: run.final for run in _of(runs, arm, task)} for arm in ("min_health", "central")
+        {run.seed: run.final for run in _of(runs, algorithm, task)} for algorithm in ("min_health", "central")
     )
     return np.array([ours[seed] - theirs[seed] for seed in sorted(ours.keys() & theirs.keys())])
 
@@ -180,8 +186,8 @@ def _singles(strata: Mapping[str, Stratum]) -> dict[str, Single]:
     return {name: singles[name] for name in strata}
 
 
-def _of(runs: Runs, arm: str, task: str) -> Runs:
-    return [run for run in runs if (run.arm, run.task) == (arm, task)]
+def _of(runs: Runs, algorithm: str, task: str) -> Runs:
+    return [run for run in runs if (run.algorithm, run.task) == (algorithm, task)]
 
 
 def _defined(values: list[float]) -> Values:

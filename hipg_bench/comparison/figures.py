@@ -39,7 +39,7 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 
 Where there are two rows, the larger team is below the smaller.
 """
-_ARMS: dict[str, tuple[str, str, str]] = {
+_ALGORITHMS: dict[str, tuple[str, str, str]] = {
     "min_health": ("min-health", "#0072B2", "o"),
     "central": ("central", "#E69F00", "X"),
     "local": ("local", "#009E73", "^"),
@@ -68,13 +68,13 @@ def draw_all(runs: Sequence[Trace], out: Path) -> list[Path]:
     """
     files: list[Path] = []
     for family, tasks in FAMILIES.items():
-        arms = _arms_of(family, tasks, runs)
-        if not arms:
+        algorithms = _algorithms_of(family, tasks, runs)
+        if not algorithms:
             continue
-        shown = [run for run in runs if run.task in tasks and run.arm in arms]
+        shown = [run for run in runs if run.task in tasks and run.algorithm in algorithms]
         for band in ("range", "iqm"):
             path = out / f"{family}{'' if band == 'range' else '_iqm'}.png"
-            figure = draw(shown, tasks, arms, band)
+            figure = draw(shown, tasks, algorithms, band)
             with replacing(path) as temporary:
                 # no date or version inside: the same runs give the same bytes
                 figure.savefig(temporary, dpi=150, format="png", metadata={"Software": None})
@@ -82,14 +82,14 @@ def draw_all(runs: Sequence[Trace], out: Path) -> list[Path]:
     return files
 
 
-def draw(runs: Sequence[Trace], tasks: Sequence[str], arms: Sequence[str], band: Band) -> Figure:
+def draw(runs: Sequence[Trace], tasks: Sequence[str], algorithms: Sequence[str], band: Band) -> Figure:
     """Draw one panel per task."""
     columns = 2 if len(tasks) in (2, 4) else 3
     rows = math.ceil(len(tasks) / columns)
     figure = Figure(figsize=(4.3 * columns, 3.3 * rows + 0.9), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for k, (axes, task) in enumerate(zip(panels, tasks, strict=True)):
-        _panel(axes, task, [run for run in runs if run.task == task], arms, band)
+        _panel(axes, task, [run for run in runs if run.task == task], algorithms, band)
         if k % columns == 0:
             axes.set_ylabel("score")
         if k >= len(tasks) - columns and axes.lines:
@@ -97,10 +97,10 @@ def draw(runs: Sequence[Trace], tasks: Sequence[str], arms: Sequence[str], band:
     figure.legend(
         handles=[
             Line2D([], [], color=colour, marker=marker, linewidth=2, markersize=7, label=name)
-            for name, colour, marker in _looks(arms).values()
+            for name, colour, marker in _looks(algorithms).values()
         ],
         loc="outside lower center",
-        ncols=3 if any("-" in arm for arm in arms) else len(arms),
+        ncols=3 if any("-" in algorithm for algorithm in algorithms) else len(algorithms),
         frameon=False,
         fontsize=12,
     )
@@ -115,7 +115,7 @@ def draw(runs: Sequence[Trace], tasks: Sequence[str], arms: Sequence[str], band:
 def band_of(
     runs: Sequence[Trace], band: Band
 ) -> tuple[Float[np.ndarray, "K"], Float[np.ndarray, "K"], Float[np.ndarray, "K"], Float[np.ndarray, "K"]]:
-    """Steps, middle, lower and upper end of an arm's runs, where all of them have been."""
+    """Steps, middle, lower and upper end of an algorithm's runs, where all of them have been."""
     curves = [blocks(run.steps, run.score) for run in runs]
     first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
     grid = np.linspace(first, last, min(len(steps) for steps, _ in curves))
@@ -128,7 +128,7 @@ def band_of(
     return grid, stats.trim_mean(values, 0.25, axis=0), low, high
 
 
-def _panel(axes: Axes, task: str, runs: Sequence[Trace], arms: Sequence[str], band: Band) -> None:
+def _panel(axes: Axes, task: str, runs: Sequence[Trace], algorithms: Sequence[str], band: Band) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=10, colors=_INK)
     axes.set_title(task, fontsize=13, loc="left", color=_INK)
@@ -139,13 +139,13 @@ def _panel(axes: Axes, task: str, runs: Sequence[Trace], arms: Sequence[str], ba
         return
     for level in (0.0, 1.0):
         axes.axhline(level, color=_PALE, linewidth=0.8, linestyle=(0, (1, 3)), zorder=0)
-    looks, counts = _looks(arms), list[int]()
-    for arm in arms:
-        own = [run for run in runs if run.arm == arm]
+    looks, counts = _looks(algorithms), list[int]()
+    for algorithm in algorithms:
+        own = [run for run in runs if run.algorithm == algorithm]
         if not own:
             continue
         steps, middle, low, high = band_of(own, band)
-        _, colour, marker = looks[arm]
+        _, colour, marker = looks[algorithm]
         every = max(1, len(steps) // 8)
         axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.14, linewidth=0)
         axes.plot(
@@ -159,24 +159,28 @@ def _panel(axes: Axes, task: str, runs: Sequence[Trace], arms: Sequence[str], ba
     axes.set_xlim(left=0)
 
 
-def _looks(arms: Sequence[str]) -> dict[str, tuple[str, str, str]]:
-    """Name, colour and marker of each arm and variant."""
+def _looks(algorithms: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """Name, colour and marker of each algorithm and variant."""
     looks, spare = dict[str, tuple[str, str, str]](), itertools.cycle(_VARIANTS)
-    for arm in arms:
-        plain, _, label = arm.partition("-")
-        name, colour, marker = _ARMS[plain]
+    for algorithm in algorithms:
+        plain, _, label = algorithm.partition("-")
+        name, colour, marker = _ALGORITHMS[plain]
         variant = f"{name}, {label.replace('_', ', ')}"
-        looks[arm] = (variant, *next(spare)) if label else (name, colour, marker)
+        looks[algorithm] = (variant, *next(spare)) if label else (name, colour, marker)
     return looks
 
 
-def _arms_of(family: str, tasks: Sequence[str], runs: Sequence[Trace]) -> list[str]:
-    """The arms to draw, plain ones first; variants belong to the figure about masking only."""
-    there = {run.arm for run in runs if run.task in tasks}
-    variants = sorted(arm for arm in there if "-" in arm)
+def _algorithms_of(family: str, tasks: Sequence[str], runs: Sequence[Trace]) -> list[str]:
+    """The algorithms to draw, plain ones first; variants belong to the figure about masking only."""
+    there = {run.algorithm for run in runs if run.task in tasks}
+    variants = sorted(algorithm for algorithm in there if "-" in algorithm)
     if family == "masking":
-        return [arm for arm in ("min_health", "central") if arm in there] + variants if variants else []
-    return [arm for arm in _ARMS if arm in there]
+        return (
+            [algorithm for algorithm in ("min_health", "central") if algorithm in there] + variants
+            if variants
+            else []
+        )
+    return [algorithm for algorithm in _ALGORITHMS if algorithm in there]
 
 
 def _source(runs: Sequence[Trace]) -> str:

@@ -1,4 +1,4 @@
-"""The results as a page: the table of verdicts, what each arm reached, and the figures."""
+"""The results as a page: the table of verdicts, what each algorithm reached, and the figures."""
 
 from __future__ import annotations
 
@@ -80,10 +80,13 @@ def task_table(judged: Sequence[Judged]) -> str:
 
 
 def score_table(runs: Sequence[Trace]) -> str:
-    """Interquartile mean, worst and best of what the runs of every arm reached."""
+    """Interquartile mean, worst and best of what the runs of every algorithm reached."""
     lines = ["| task | " + " | ".join(BUNDLES) + " |", "|---" * (1 + len(BUNDLES)) + "|"]
     for task in TASKS:
-        cells = [_cell([run.final for run in runs if (run.task, run.arm) == (task, arm)]) for arm in BUNDLES]
+        cells = [
+            _cell([run.final for run in runs if (run.task, run.algorithm) == (task, algorithm)])
+            for algorithm in BUNDLES
+        ]
         lines.append(f"| {task} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

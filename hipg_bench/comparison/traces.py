@@ -26,7 +26,7 @@ class Trace:
     """A training run.
 
     Attributes:
-        arm: min_health, central, ..., with ``-<label>`` for a variant.
+        algorithm: min_health, central, ..., with ``-<label>`` for a variant.
         task: its name.
         seed: of the training.
         steps: (K,) environment steps, rising.
@@ -36,7 +36,7 @@ class Trace:
         final: score of the last policy by the standard protocol; else the mean of the last tenth.
     """
 
-    arm: str
+    algorithm: str
     task: str
     seed: int
     steps: Float[np.ndarray, "K"]
@@ -53,18 +53,18 @@ class Trace:
 
 
 def traces(agents: Path) -> list[Trace]:
-    """Read all curves of bundles that are arms of the comparison, on tasks that have a score.
+    """Read all curves of bundles that are algorithms of the comparison, on tasks that have a score.
 
     The runs of a task are compared by the same measurement: by periodic evaluations where all runs have
     them, else by the returns of the training's own episodes.
     """
     curves: dict[str, list[tuple[Path, str, TaskSpec, int]]] = {}
     for folder in sorted(agents.glob("*/")):
-        arm = _arm(folder.name)
-        for path in sorted(folder.glob("*/seed*.curve.csv")) if arm is not None else ():
+        algorithm = _algorithm(folder.name)
+        for path in sorted(folder.glob("*/seed*.curve.csv")) if algorithm is not None else ():
             spec, seed = tasks().get(path.parent.name), re.match(r"seed(\d+)\.", path.name)
-            if arm is not None and spec is not None and spec.anchors is not None and seed is not None:
-                curves.setdefault(spec.task, []).append((path, arm, spec, int(seed[1])))
+            if algorithm is not None and spec is not None and spec.anchors is not None and seed is not None:
+                curves.setdefault(spec.task, []).append((path, algorithm, spec, int(seed[1])))
     found: list[Trace | None] = []
     for ones in curves.values():
         evaluated = [_read(*one, tried=True) for one in ones]
@@ -72,7 +72,7 @@ def traces(agents: Path) -> list[Trace]:
         chosen = trained if None in evaluated and any(trained) else evaluated
         found += [one or other for one, other in zip(chosen, evaluated, strict=True)]
     runs = [run for run in found if run is not None]
-    return sorted(runs, key=lambda run: (run.arm, run.task, run.seed))
+    return sorted(runs, key=lambda run: (run.algorithm, run.task, run.seed))
 
 
 def blocks(
@@ -83,22 +83,22 @@ def blocks(
     return np.array([steps[part].mean() for part in parts]), np.array([score[part].mean() for part in parts])
 
 
-def _arm(bundle: str) -> str | None:
-    """The arm, with its label, that a bundle's name stands for."""
-    for arm, name in BUNDLES.items():
+def _algorithm(bundle: str) -> str | None:
+    """The algorithm, with its label, that a bundle's name stands for."""
+    for algorithm, name in BUNDLES.items():
         if bundle == name:
-            return arm
+            return algorithm
         if bundle.startswith(f"{name}_"):
-            return f"{arm}-{bundle[len(name) + 1 :]}"
+            return f"{algorithm}-{bundle[len(name) + 1 :]}"
     return None
 
 
-def _read(path: Path, arm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Trace | None:
+def _read(path: Path, algorithm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Trace | None:
     """The run of a curve on today's anchors, if what is asked for was measured.
 
     Args:
         path: of the curve.
-        arm: whose.
+        algorithm: whose.
         spec: the task.
         seed: of the training.
         tried: the periodic evaluations' returns; else those of the training's own episodes.
@@ -117,6 +117,6 @@ def _read(path: Path, arm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Tr
     score = np.array([spec.score(value) for value in returns])
     final = record.get("result", {}).get("return")
     last = score[steps > (1 - _END) * steps[-1]].mean()
-    warm = bool(record.get("settings", {}).get("start"))
+    warm = bool(record.get("settings", {}).get("initial_policy"))
     reached = float(last if final is None else spec.score(final))
-    return Trace(arm, spec.task, seed, steps, score, tried, warm, reached)
+    return Trace(algorithm, spec.task, seed, steps, score, tried, warm, reached)

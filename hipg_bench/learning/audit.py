@@ -179,8 +179,10 @@ def load(path: Path) -> tuple[Actor, Critic, Settings]:
     try:
         settings = parse(Settings, json.loads(text), str(source))
         spec = task_spec(settings.task)
-        if settings.arm == "local":
-            raise HipgError(f"{path}: a local critic cannot be asked about the health of others (arm local)")
+        if settings.algorithm == "local":
+            raise HipgError(
+                f"{path}: a local critic cannot be asked about the health of others (algorithm local)"
+            )
         actor, critic = networks(settings, family_of(spec).layout, clips=spec.clip_actions)
         actor.load_state_dict(tensors["actor"])
         critic.load_state_dict(tensors["critic"])

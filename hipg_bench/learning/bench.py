@@ -20,7 +20,7 @@ class Iteration:
     """Medians over iterations.
 
     Attributes:
-        task, arm, num_envs, rollout, epochs, minibatches, threads: what was run.
+        task, algorithm, num_envs, rollout, epochs, minibatches, threads: what was run.
         seconds: of a whole iteration.
         rollout_share, credit_share, update_share: of it.
         agent_steps: learned from per second, N of them per control step of a world.
@@ -28,7 +28,7 @@ class Iteration:
     """
 
     task: str
-    arm: str
+    algorithm: str
     num_envs: int
     rollout: int
     epochs: int
@@ -59,7 +59,7 @@ def iteration_time(
     """
     settings = recommended(task, **changes or {})
     if not isinstance(settings, Settings):
-        raise SpecError(f"{task}: the arms of MAPPO are timed, got {settings.arm!r}")
+        raise SpecError(f"{task}: the algorithms of MAPPO are timed, got {settings.algorithm!r}")
     torch.set_num_threads(threads)
     arithmetic.prepare()
     trainer = Trainer(settings)
@@ -73,8 +73,8 @@ def iteration_time(
     taken = float(np.median(whole))
     return [
         Iteration(
-            task, settings.arm, settings.num_envs, settings.rollout, settings.epochs, settings.minibatches,
-            threads,
+            task, settings.algorithm, settings.num_envs, settings.rollout, settings.epochs,
+            settings.minibatches, threads,
             seconds=taken,
             rollout_share=rollout,
             credit_share=credit,

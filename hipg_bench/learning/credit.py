@@ -1,4 +1,4 @@
-"""Who gets the credit: one pure function per arm of the paper's comparison.
+"""Who gets the credit: one pure function per algorithm of the paper's comparison.
 
 Each maps what a central critic knows to the weight Psi_i that multiplies agent i's log-probability
 gradient (eqn:policy_gradients_multi_agent).
@@ -15,7 +15,7 @@ from torch import Tensor
 def advantage(
     target: Float[Tensor, "X K"], value: Float[Tensor, "X K"], health: Float[Tensor, "X N"]
 ) -> Float[Tensor, "X N"]:
-    """Psi_i = h_i (V_targ - V): the arms ``central``, V(s) shared by all, and ``local``, V(o_i) of each.
+    """Psi_i = h_i (V_targ - V): ``central`` with V(s) shared by all, ``local`` with V(o_i) of each.
 
     Args:
         target: V_targ of eqn:value_target, K = 1 for all agents or K = N.

@@ -81,7 +81,13 @@ class Forks:
         value = critic(data["state"], elapsed)
         next_value = critic(data["next_state"], elapsed + 1 / self.env.spec.horizon)
         advantage = gae(
-            data["reward"], value, next_value, data["ended"], data["done"], settings.gamma, settings.lam
+            data["reward"],
+            value,
+            next_value,
+            data["ended"],
+            data["done"],
+            settings.gamma,
+            settings.gae_lambda,
         )
         return data["state"], elapsed, value + advantage
 

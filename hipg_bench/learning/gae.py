@@ -14,11 +14,11 @@ def gae(
     terminated: Bool[Tensor, "T *#who"],
     done: Bool[Tensor, "T *#who"],
     gamma: float,
-    lam: float,
+    gae_lambda: float,
 ) -> Float[Tensor, "T *who"]:
     """Advantage of each step; the value target of eqn:value_target is this plus ``value``.
 
-    A_t = delta_t + gamma * lam * A_{t+1} with delta_t = r_t + gamma * V_{t+1} - V_t. Termination ends
+    A_t = delta_t + gamma * gae_lambda * A_{t+1} with delta_t = r_t + gamma * V_{t+1} - V_t. Termination ends
     both sums; truncation ends the sum over A but still bootstraps delta from V of the state it cut.
 
     ``who`` is (B, K): K values a world, with one reward for all.
@@ -30,12 +30,12 @@ def gae(
         terminated: the rules ended the episode at t.
         done: terminated or truncated at t.
         gamma: discount.
-        lam: GAE's lambda; 1 gives returns minus values.
+        gae_lambda: GAE's lambda; 1 gives returns minus values.
     """
     delta = reward + gamma * torch.where(terminated, 0.0, next_value) - value
     advantage = torch.empty_like(delta)
     carried = torch.zeros_like(delta[0])
     for t in range(len(delta) - 1, -1, -1):
-        carried = delta[t] + gamma * lam * torch.where(done[t], 0.0, carried)
+        carried = delta[t] + gamma * gae_lambda * torch.where(done[t], 0.0, carried)
         advantage[t] = carried
     return advantage

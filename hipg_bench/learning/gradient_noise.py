@@ -2,7 +2,7 @@
 
 A baseline leaves the gradient's mean alone (lemma 1), however right or wrong it is; all that it can do is
 take noise away. So one that leaves a share f of another's noise is worth 1/f times as many episodes, and
-no more. That bounds what the arms ``central`` and ``min_health``, which differ by the baseline, can
+no more. That bounds what the algorithms ``central`` and ``min_health``, which differ by the baseline, can
 differ by at this point of the training.
 """
 

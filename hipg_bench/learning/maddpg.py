@@ -81,7 +81,7 @@ class Trainer(ReplayTrainer):
         """Make worlds and networks; the replay is kept in ``folder``."""
         super().__init__(settings, folder)
         env, self.options = self.env, settings
-        self.form = Form(activation="relu", head="tanh", reach=settings.reach)
+        self.form = Form(activation="relu", head="tanh", reach=settings.action_scale)
         actors = Actors(env.num_agents, env.observation_size, env.action_size, settings.hidden)
         self.body = actors.body
         self.actor = TensorDictModule(actors, ["observation", "acting"], ["unsquashed", "action"])
@@ -92,12 +92,12 @@ class Trainer(ReplayTrainer):
         critic = TensorDictModule(critics, [sees, "action", "played"], ["state_action_value"])
         self.loss = DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True)
         self.loss.make_value_estimator(gamma=settings.gamma)
-        self.targets = SoftUpdate(self.loss, tau=settings.target_share)
+        self.targets = SoftUpdate(self.loss, tau=settings.tau)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), settings.rate)
         self.exploration: Any = AdditiveGaussianModule(
             Bounded(-1.0, 1.0, torch.Size([env.action_size])),
             settings.noise,
-            settings.noise * settings.noise_left,
+            settings.noise * settings.final_noise,
             max(1, settings.noise_steps // settings.num_envs),
         )
 
@@ -111,8 +111,8 @@ class Trainer(ReplayTrainer):
         return chosen.numpy()
 
     def pushes(self, choice: Float[np.ndarray, "B N A"]) -> Float[np.ndarray, "B N A"]:
-        """Actions in units of ``reach``."""
-        return choice * self.options.reach
+        """Actions in units of ``action_scale``."""
+        return choice * self.options.action_scale
 
     def improve(self, batch: TensorDict) -> dict[str, float]:
         """Improve all actors and critics on a sample. Returns what to log."""
@@ -123,7 +123,7 @@ class Trainer(ReplayTrainer):
             after[name] = after[name][:, None].expand(-1, num_agents, 1)
         losses = self.loss(batch)
         out = self.actor(batch.select("observation", "acting"))["unsquashed"]
-        mean = losses["loss_value"] + losses["loss_actor"] + settings.saturation * out.square().mean()
+        mean = losses["loss_value"] + losses["loss_actor"] + settings.pretanh_l2 * out.square().mean()
         self.optimizer.zero_grad()
         (num_agents * mean).backward()  # a sum of N agents' losses, which share no weight
         clip_gradients(list(self.loss.parameters()), num_agents, settings.max_grad_norm)

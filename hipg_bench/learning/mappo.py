@@ -1,10 +1,10 @@
 """MAPPO with min-health crediting (algorithm 1 of the paper), top to bottom.
 
 One policy, shared by all agents, acts on each agent's own observation; the critic sees the joint
-state, health included, or in the arm ``local`` each agent's own observation. What sets the arms apart
-is `Trainer.assign_credit`: how the team's advantage becomes each agent's weight Psi_i.
+state, health included, or in the algorithm ``local`` each agent's own observation. What sets the algorithms
+apart is `Trainer.assign_credit`: how the team's advantage becomes each agent's weight Psi_i.
 
-Where the recommended settings differ from the authors' code, in every arm: dead samples are masked and
+Where the recommended settings differ from the authors' code, in every algorithm: dead samples are masked and
 Psi is normalised over live samples only; returns are normalised instead of clipping the value's
 change; truncation bootstraps, termination does not. `Settings` names each of these.
 """
@@ -35,7 +35,7 @@ from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
 """Bounds of the actor's learning rate."""
-_ENTROPY_WEIGHTS = (1e-5, 0.1)
+_ENTROPY_COEFS = (1e-5, 0.1)
 """Bounds of the entropy bonus where it follows ``target_entropy``."""
 _START_COUNTS = 20
 """Rollouts that the normalisation of a start weighs."""
@@ -87,13 +87,13 @@ class Trainer:
             weights=settings.weights,
             dead_observation=settings.dead_observation,
         )
-        self.entropy_weight = settings.entropy
+        self.entropy_coef = settings.entropy_coef
         self.actor, self.critic = networks(settings, self.env.layout, clips=self.env.spec.clip_actions)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, eps=1e-5)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, eps=1e-5)
         self.iteration = 0
         self.step: Step = self.env.reset()
-        self.forks = Forks(settings, self.env) if settings.forks and settings.arm != "local" else None
+        self.forks = Forks(settings, self.env) if settings.forks and settings.algorithm != "local" else None
 
     def iterate(self) -> dict[str, float]:
         """One round of algorithm 1: roll out, value targets, credit, update. Returns what to log."""
@@ -187,23 +187,25 @@ class Trainer:
 
     @torch.no_grad()
     def assign_credit(self, data: Rollout) -> tuple[Float[Tensor, "T B K"], Float[Tensor, "T B N"]]:
-        """Value targets (eqn:value_target), and each agent's weight Psi (the arm).
+        """Value targets (eqn:value_target), and each agent's weight Psi (the algorithm).
 
-        There are K = N critics' views in the arm ``local``, else K = 1. The critic's running normalisation
-        takes in the rollout on the way; the actor's does so after its update, since the ratio of new to
-        old probabilities must be of the observations as the rollout normalised them.
+        There are K = N critics' views in the algorithm ``local``, else K = 1. The critic's running
+        normalisation takes in the rollout on the way; the actor's does so after its update, since the ratio
+        of new to old probabilities must be of the observations as the rollout normalised them.
         """
         settings = self.settings
         self.critic.norm.update(self._shown(data)[0][:-1].flatten(0, -2))
         value, target = self.value_targets(data)
-        masked = settings.mask_dead or settings.arm == "min_health"
+        masked = settings.mask_dead or settings.algorithm == "min_health"
         health = (data.health if masked else torch.ones_like(data.health)).flatten(0, 1)
-        if settings.arm == "min_health":
+        if settings.algorithm == "min_health":
             psi = credit.min_health(target.flatten(0, 1), self.value_without_each(data), health)
         else:
             psi = credit.advantage(target.flatten(0, 1), value.flatten(0, 1), health)
-        if settings.psi_over != "minibatch":
-            counted = health > 0 if settings.psi_over == "live" else torch.ones_like(health, dtype=torch.bool)
+        if settings.advantage_norm != "minibatch":
+            counted = (
+                health > 0 if settings.advantage_norm == "live" else torch.ones_like(health, dtype=torch.bool)
+            )
             psi = health.ceil() * credit.normalized(psi, counted)
         self.critic.returns.update(target.flatten()[:, None])
         return target, psi.view_as(data.health)
@@ -218,12 +220,12 @@ class Trainer:
         ended = data.terminated if settings.bootstrap_truncation else data.done
         return value, value + gae(
             data.reward[..., None], value, next_value, ended[..., None], data.done[..., None],
-            settings.gamma, settings.lam,
+            settings.gamma, settings.gae_lambda,
         )  # fmt: skip
 
     def _shown(self, view: Rollout | End) -> tuple[Float[Tensor, "*T B K F"], Float[Tensor, "*T B K"]]:
-        """What the arm's critic is shown: the joint state, or every agent's own observation."""
-        seen = view.observation if self.settings.arm == "local" else view.state[..., None, :]
+        """What the algorithm's critic is shown: the joint state, or every agent's own observation."""
+        seen = view.observation if self.settings.algorithm == "local" else view.state[..., None, :]
         return seen, view.elapsed[..., None].expand(seen.shape[:-1])
 
     def value_without_each(self, data: Rollout) -> Float[Tensor, "TB N"]:
@@ -257,14 +259,14 @@ class Trainer:
             divergence = 0.0
             for part in torch.randperm(len(weight)).chunk(settings.minibatches):
                 credited = weight[part]
-                if settings.psi_over == "minibatch":
+                if settings.advantage_norm == "minibatch":
                     credited = (credited - credited.mean()) / (credited.std() + 1e-8)
                 self.actor_optimizer.zero_grad()
                 for piece, psi_of in zip(part.split(_PIECE), credited.split(_PIECE), strict=True):
                     policy = self.actor.distribution(observation.index_select(0, piece))
                     change = policy.log_prob(action[piece]).sum(-1) - log_prob[piece]
                     spread = policy.entropy().sum(-1).mean()
-                    loss = -losses.surrogate(change, psi_of, settings.clip) - self.entropy_weight * spread
+                    loss = -losses.surrogate(change, psi_of, settings.clip) - self.entropy_coef * spread
                     (loss * (len(piece) / len(part))).backward()
                     # k3 estimator of KL(old, new): unbiased and never negative
                     divergence += float((change.exp() - 1 - change).sum().detach()) / len(weight)
@@ -274,7 +276,7 @@ class Trainer:
         self._follow_entropy(entropy / self.env.action_size)
         rate = self.actor_optimizer.param_groups[0]["lr"]
         return {
-            "kl": divergence, "entropy": entropy, "actor_rate": rate, "entropy_weight": self.entropy_weight,
+            "kl": divergence, "entropy": entropy, "actor_rate": rate, "entropy_coef": self.entropy_coef,
         }  # fmt: skip
 
     def _follow_divergence(self, divergence: float) -> None:
@@ -290,7 +292,7 @@ class Trainer:
         target = self.settings.target_entropy
         if target is not None:
             factor = 1.1 if entropy < target else 1 / 1.1
-            self.entropy_weight = float(np.clip(self.entropy_weight * factor, *_ENTROPY_WEIGHTS))
+            self.entropy_coef = float(np.clip(self.entropy_coef * factor, *_ENTROPY_COEFS))
 
     def _update_critic(self, data: Rollout, target: Float[Tensor, "T B K"]) -> dict[str, float]:
         """Descend the squared error of normalised values (eqn:value_update)."""
@@ -318,7 +320,7 @@ class Trainer:
                 error += float((value.detach() - aim[part]).square().mean()) / len(parts)
         return {"value_loss": error, "explained": 1 - error / float(aim.var())}
 
-    def start_from(self, path: Path) -> None:
+    def start_from_policy(self, path: Path) -> None:
         """Begin with a policy file's weights.
 
         Raises:
@@ -357,7 +359,7 @@ class Trainer:
             "critic_optimizer": self.critic_optimizer.state_dict(),
             "random": torch.get_rng_state(),
             "worlds": torch.from_numpy(self.env.rows),
-            "entropy_weight": self.entropy_weight,
+            "entropy_coef": self.entropy_coef,
         }
         if self.forks is not None:
             content["forks"] = torch.from_numpy(self.forks.env.rows)
@@ -372,7 +374,7 @@ class Trainer:
         content = checkpoint.load(path)
         self.settings.check_resumes(content["settings"], path)
         self.iteration = content["iteration"]
-        self.entropy_weight = content.get("entropy_weight", self.settings.entropy)
+        self.entropy_coef = content.get("entropy_coef", self.settings.entropy_coef)
         self.actor.load_state_dict(content["actor"])
         self.critic.load_state_dict(content["critic"])
         self.actor_optimizer.load_state_dict(content["actor_optimizer"])
@@ -392,16 +394,16 @@ def networks(settings: Settings, layout: TaskLayout, *, clips: bool) -> tuple[Ac
         clips: whether the task clips actions; where it does not, the exported policy must not either.
     """
     head = "mean" if clips else "linear"
-    groups = settings.attends
+    groups = settings.attention_groups
     actor = Actor(
         layout.observation.size,
         layout.action.size,
         settings.actor_hidden,
-        settings.std,
+        settings.initial_std,
         form=AttentionForm.of(layout.observation, *groups, head=head) if groups else Form(head=head),
         normalize=settings.normalize_inputs,
     )
-    local = settings.arm == "local"
+    local = settings.algorithm == "local"
     critic = Critic(
         layout.observation.size if local else layout.state.size,
         settings.critic_hidden,

@@ -185,7 +185,7 @@ class Actor(nn.Module):
         observation_size: int,
         action_size: int,
         hidden: tuple[int, ...],
-        std: float,
+        initial_std: float,
         *,
         form: Form,
         normalize: bool = True,
@@ -201,7 +201,7 @@ class Actor(nn.Module):
         else:
             self.norm = RunningNorm(observation_size, fixed)
             self.body = mlp((observation_size, *hidden, action_size), Tanh, 0.01)
-        self.log_std = nn.Parameter(torch.full((action_size,), math.log(std)))
+        self.log_std = nn.Parameter(torch.full((action_size,), math.log(initial_std)))
 
     def forward(self, observation: Float[Tensor, "... O"]) -> torch.distributions.Normal:
         """Distribution of each action coordinate."""
@@ -243,7 +243,7 @@ class Actor(nn.Module):
 class Critic(nn.Module):
     """A value function of what it is shown and of the share of the horizon that has passed.
 
-    It is shown the joint state, or each agent's observation (the arm ``local``), F numbers either
+    It is shown the joint state, or each agent's observation (the algorithm ``local``), F numbers either
     way, and predicts returns normalised by their running mean and deviation.
     """
 

@@ -84,7 +84,7 @@ class Trainer(ReplayTrainer):
         )
         self.loss = QMixerLoss(self.pairs, mixer, action_space="categorical", delay_value=True)
         self.loss.make_value_estimator(gamma=settings.gamma)
-        self.targets = SoftUpdate(self.loss, tau=settings.target_share)
+        self.targets = SoftUpdate(self.loss, tau=settings.tau)
         self.optimizer = torch.optim.RMSprop(self.loss.parameters(), settings.rate, alpha=0.99, eps=1e-5)
         self.exploration: Any = EGreedyModule(
             Categorical(settings.bins),

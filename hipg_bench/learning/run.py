@@ -82,7 +82,9 @@ def new_learner(settings: AnySettings, out: Path) -> Learner:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in ("torchrl", "tensordict"):
             raise
-        raise HipgError(f"arm {settings.arm!r} needs TorchRL: pip install 'hipg-bench[torchrl]'") from error
+        raise HipgError(
+            f"algorithm {settings.algorithm!r} needs TorchRL: pip install 'hipg-bench[torchrl]'"
+        ) from error
     return mappo.Trainer(settings)
 
 
@@ -115,7 +117,7 @@ def train(
         UnknownNameError: no such service.
         ResumeError: the folder holds a run with other settings, a damaged one, or files of somebody's that
             would be overwritten, or another process is training in it.
-        BundleError: ``settings.start`` does not fit.
+        BundleError: ``settings.initial_policy`` does not fit.
         HipgError: the learner is built on TorchRL, or tracked by a service, which is not installed.
     """
     check_services(track)
@@ -178,8 +180,8 @@ def _train_alone(
         check_seal(curve)
         learner.resume(checkpoint)
         rows = _read_curve(curve, learner.iteration)
-    elif isinstance(learner, mappo.Trainer) and learner.settings.start:
-        learner.start_from(Path(learner.settings.start))
+    elif isinstance(learner, mappo.Trainer) and learner.settings.initial_policy:
+        learner.start_from_policy(Path(learner.settings.initial_policy))
     before = float(rows[-1]["seconds"]) if rows else 0.0
     worlds = trial.Trial(settings.task, threads=torch.get_num_threads())
     started = time.monotonic()
@@ -293,8 +295,10 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
     }
     if spec.task not in tasks():
         content["spec"] = spec.model_dump(mode="json")
-    if isinstance(settings, Settings) and settings.start:
-        content["start_fingerprint"] = hashlib.sha256(Path(settings.start).read_bytes()).hexdigest()[:12]
+    if isinstance(settings, Settings) and settings.initial_policy:
+        content["initial_policy_fingerprint"] = hashlib.sha256(
+            Path(settings.initial_policy).read_bytes()
+        ).hexdigest()[:12]
     if isinstance(settings, MaddpgSettings | QmixSettings):
         content["versions"]["torchrl"] = metadata.version("torchrl")
     return json.dumps(content, indent=2) + "\n"

@@ -67,11 +67,11 @@ class RunSettings(Params):
             ResumeError: something other than ``steps`` and ``eval_every`` differs.
         """
         theirs, own = json.loads(saved), self.model_dump()
-        if theirs["arm"] == own["arm"]:
+        if theirs["algorithm"] == own["algorithm"]:
             theirs = type(self)(**theirs).model_dump()
         changed = {name for name in own if own[name] != theirs.get(name)} - {"steps", "eval_every"}
         if changed:
-            name = min(changed)
+            name = "algorithm" if "algorithm" in changed else min(changed)
             was = theirs.get(name)
             raise ResumeError(
                 f"{path} was trained with {name} = {was!r}, not {own[name]!r}: choose another --out"
@@ -82,34 +82,35 @@ class Settings(RunSettings):
     """Everything that defines a MAPPO run.
 
     Attributes:
-        arm: how credit is assigned, a function of `hipg_bench.learning.credit`.
+        algorithm: how credit is assigned, a function of `hipg_bench.learning.credit`.
         epochs, minibatches: passes over a rollout, and parts each is cut into.
-        lam: GAE's lambda.
+        gae_lambda: GAE's lambda.
         clip: PPO's epsilon.
-        entropy: weight of the entropy bonus; its first value where ``target_entropy`` is given.
+        entropy_coef: weight of the entropy bonus; its first value where ``target_entropy`` is given.
         target_entropy: entropy of an action coordinate, nats, that the weight is moved towards after every
             rollout, so that runs of different credit rules explore alike; None leaves the weight alone. A
             normal distribution of standard deviation s has 1.42 + log(s).
-        start: policy file whose weights the actor begins with, of any task with the same observations and
-            actions; the critic begins anew. So larger teams go on from what smaller ones learned.
+        initial_policy: policy file whose weights the actor begins with, of any task with the same
+            observations and actions; the critic begins anew. So larger teams go on from what smaller ones
+            learned.
         actor_rate: the actor's first learning rate; it then follows ``target_kl``.
         critic_rate: the critic's learning rate.
         target_kl: the actor's rate is halved above twice this divergence per epoch, raised below half;
             None leaves the rate alone.
         max_grad_norm: gradients are cut to this norm.
-        std: exploration's first standard deviation, in units of full action.
+        initial_std: exploration's first standard deviation, in units of full action.
         actor_hidden, critic_hidden: widths of the hidden layers.
-        attends: groups of observation blocks, by what their names begin with, that the actor looks at slot by
-            slot (`hipg_bench.policies.attention`; ``actor_hidden`` begins with the embeddings' width); none:
-            it is an MLP of the whole observation.
-        mask_dead: dead agents' samples take no part in the actor's update; else only the arm
+        attention_groups: groups of observation blocks, by what their names begin with, that the actor looks
+            at slot by slot (`hipg_bench.policies.attention`; ``actor_hidden`` begins with the embeddings'
+            width); none: it is an MLP of the whole observation.
+        mask_dead: dead agents' samples take no part in the actor's update; else only the algorithm
             ``min_health`` leaves them without weight, as in the authors' code.
         zero_dead_actions: a dead agent's action is stored as zeros beside the log-probability of what
             it had drawn, a quirk of the authors' code; matters only where the dead are not masked.
         dead_observation: what a dead agent's row of the observation holds in training: ``blank``, its health
             and zeros; or ``live``, what a living agent would observe there, as in the authors' code. Matters
             only where the dead are not masked.
-        psi_over: Psi is normalised over the rollout's live samples, over the whole ``batch``, zeros of
+        advantage_norm: Psi is normalised over the rollout's live samples, over the whole ``batch``, zeros of
             the dead included, or anew over every ``minibatch``.
         value_clip: how far a value may move in an update before its gradient is cut, in units of
             reward, as in the authors' code; None does not clip.
@@ -122,26 +123,26 @@ class Settings(RunSettings):
             the critic learns from them (`hipg_bench.learning.forks`).
     """
 
-    arm: Literal["min_health", "central", "local"] = "min_health"
+    algorithm: Literal["min_health", "central", "local"] = "min_health"
     epochs: int = pydantic.Field(default=5, ge=1, le=100)
     minibatches: int = pydantic.Field(default=4, ge=1, le=1000)
-    lam: float = pydantic.Field(default=0.95, ge=0, le=1)
+    gae_lambda: float = pydantic.Field(default=0.95, ge=0, le=1)
     clip: float = pydantic.Field(default=0.2, gt=0, lt=1)
-    entropy: float = pydantic.Field(default=0.002, ge=0, le=1)
+    entropy_coef: float = pydantic.Field(default=0.002, ge=0, le=1)
     target_entropy: float | None = pydantic.Field(default=None, ge=-10, le=10)
-    start: str | None = None
+    initial_policy: str | None = None
     actor_rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     critic_rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     target_kl: float | None = pydantic.Field(default=0.015, gt=0, le=1)
     max_grad_norm: float = pydantic.Field(default=1.0, gt=0)
-    std: float = pydantic.Field(default=0.6, gt=0, le=5)
+    initial_std: float = pydantic.Field(default=0.6, gt=0, le=5)
     actor_hidden: Widths = (128, 128)
     critic_hidden: Widths = (256, 256)
-    attends: tuple[str, ...] = ()
+    attention_groups: tuple[str, ...] = ()
     mask_dead: bool = True
     zero_dead_actions: bool = False
     dead_observation: Literal["blank", "live"] = "blank"
-    psi_over: Literal["live", "batch", "minibatch"] = "live"
+    advantage_norm: Literal["live", "batch", "minibatch"] = "live"
     value_clip: float | None = pydantic.Field(default=None, gt=0)
     normalize_inputs: bool = True
     normalize_returns: bool = True
@@ -160,7 +161,7 @@ class ReplaySettings(RunSettings):
         update_every: environment steps per update.
         rate: the optimiser's learning rate.
         max_grad_norm: gradients are cut to this norm.
-        target_share: how far the target networks move towards the trained ones in every update.
+        tau: how far the target networks move towards the trained ones in every update.
         hidden: widths of the hidden layers of what acts.
         mask_dead: what a dead agent is told counts for nothing; else networks go on guessing for it.
         normalize_inputs: running normalisation of what networks see.
@@ -175,7 +176,7 @@ class ReplaySettings(RunSettings):
     update_every: float = pydantic.Field(default=12.0, gt=0)
     rate: float = pydantic.Field(default=1e-3, gt=0, le=1)
     max_grad_norm: float = pydantic.Field(default=5.0, gt=0)
-    target_share: float = pydantic.Field(default=0.02, gt=0, le=1)
+    tau: float = pydantic.Field(default=0.02, gt=0, le=1)
     hidden: Widths = (128, 128)
     mask_dead: bool = True
     normalize_inputs: bool = True
@@ -190,22 +191,22 @@ class MaddpgSettings(ReplaySettings):
         critic_hidden: widths of the critics' hidden layers.
         critic_sees: beside all actions, the joint ``state`` or, as in the authors' code, all agents'
             ``observations``.
-        noise: exploration's first standard deviation, in units of ``reach``.
-        noise_left: share of it that is left in the end.
+        noise: exploration's first standard deviation, in units of ``action_scale``.
+        final_noise: share of it that is left in the end.
         noise_steps: environment steps until then.
-        saturation: weight of the mean square of the actor's outputs before they are squashed.
-        reach: full action. The authors' MADDPG pushes five times as hard as their PPO on tasks that do not
-            clip actions.
+        pretanh_l2: weight of the mean square of the actor's outputs before they are squashed.
+        action_scale: full action. The authors' MADDPG pushes five times as hard as their PPO on tasks that do
+            not clip actions.
     """
 
-    arm: Literal["maddpg"] = "maddpg"
+    algorithm: Literal["maddpg"] = "maddpg"
     critic_hidden: Widths = (256, 256)
     critic_sees: Literal["state", "observations"] = "state"
     noise: float = pydantic.Field(default=0.3, ge=0, le=2)
-    noise_left: float = pydantic.Field(default=0.3, ge=0, le=1)
+    final_noise: float = pydantic.Field(default=0.3, ge=0, le=1)
     noise_steps: int = pydantic.Field(default=150_000, ge=1)
-    saturation: float = pydantic.Field(default=1e-3, ge=0)
-    reach: float = pydantic.Field(default=1.0, gt=0, le=10)
+    pretanh_l2: float = pydantic.Field(default=1e-3, ge=0)
+    action_scale: float = pydantic.Field(default=1.0, gt=0, le=10)
 
 
 class QmixSettings(ReplaySettings):
@@ -219,11 +220,11 @@ class QmixSettings(ReplaySettings):
         epsilon_steps: environment steps until then.
     """
 
-    arm: Literal["qmix"] = "qmix"
+    algorithm: Literal["qmix"] = "qmix"
     gamma: float = pydantic.Field(default=0.9, ge=0, le=1)
     learning_starts: int = pydantic.Field(default=2000, ge=1)
     max_grad_norm: float = pydantic.Field(default=10.0, gt=0)
-    target_share: float = pydantic.Field(default=0.01, gt=0, le=1)
+    tau: float = pydantic.Field(default=0.01, gt=0, le=1)
     hidden: Widths = (64, 64)
     bins: int = pydantic.Field(default=8, ge=2, le=256)
     mixer_width: int = pydantic.Field(default=32, ge=1, le=4096)
@@ -233,14 +234,16 @@ class QmixSettings(ReplaySettings):
 
 AnySettings = Settings | MaddpgSettings | QmixSettings
 
-ARMS: Mapping[str, type[Settings] | type[MaddpgSettings] | type[QmixSettings]] = {
+ALGORITHMS: Mapping[str, type[Settings] | type[MaddpgSettings] | type[QmixSettings]] = {
     "min_health": Settings,
     "central": Settings,
     "local": Settings,
     "maddpg": MaddpgSettings,
     "qmix": QmixSettings,
 }
-"""What a run is told, by arm."""
+"""Settings of each algorithm."""
+SYNONYMS: Mapping[str, str] = {"mappo": "central", "ippo": "local"}
+"""Other names that the field uses."""
 
 
 _EPISODES_PER_TRIAL = 1000
@@ -248,18 +251,19 @@ _EPISODES_PER_TRIAL = 1000
 _BY_FAMILY: Mapping[str, dict[str, Any]] = {
     # what a drone does shows in the team's distances at once: a short trace has less of the others' luck
     "hazard_nav": {
-        "steps": 3_000_000, "minibatches": 8, "gamma": 0.9, "lam": 0.9, "entropy": 0.008,
+        "steps": 3_000_000, "minibatches": 8, "gamma": 0.9, "gae_lambda": 0.9, "entropy_coef": 0.008,
         # one way of looking at every point: what an MLP has to learn for each of them anew
-        "attends": ("point", "neighbor"), "actor_hidden": (32, 128),
+        "attention_groups": ("point", "neighbor"), "actor_hidden": (32, 128),
     },
     # reward is so rare at first that noise would collapse exploration without a strong bonus
     "hazard_comm": {
-        "epochs": 4, "minibatches": 8, "entropy": 0.01,
-        "attends": ("neighbor", "wreck"), "actor_hidden": (32, 128),
+        "epochs": 4, "minibatches": 8, "entropy_coef": 0.01,
+        "attention_groups": ("neighbor", "wreck"), "actor_hidden": (32, 128),
     },
     "multiwalker": {
         "steps": 12_000_000, "num_envs": 512, "rollout": 32, "minibatches": 6, "gamma": 0.99,
-        "entropy": 0.001, "std": 0.3,  # whoever stumbles less learns to stand in a fifth of the steps
+        "entropy_coef": 0.001, 
+        "initial_std": 0.3,  # teams that fall less often learn to stand in a fifth of the steps
         "weights": {"alive": 0.1},  # without it teams learn to dive before they learn to stand
     },
 }  # fmt: skip
@@ -273,57 +277,67 @@ _MADDPG_BY_FAMILY: Mapping[str, dict[str, Any]] = {
 _QMIX_BY_FAMILY: Mapping[str, dict[str, Any]] = {
     # a longer view, faster targets or slower exploration, and the best of 12 choices at once is so
     # overestimated that values grow without bound
-    "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.95, "target_share": 0.005},
+    "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.95, "tau": 0.005},
 }
 
 
 def recommended(task: str, **changes: Any) -> AnySettings:
-    """The recommended settings for a task, with some changed; ``arm`` says for which learner.
+    """The recommended settings for a task, with some changed; ``algorithm`` says for which learner.
 
     Raises:
         UnknownNameError: no such task.
-        SpecError: no such arm, or a setting that is not allowed.
+        SpecError: no such algorithm, or a setting that is not allowed.
     """
-    family, arm = task_spec(task).family, changes.get("arm", "min_health")
-    by_family = {"maddpg": _MADDPG_BY_FAMILY, "qmix": _QMIX_BY_FAMILY}.get(arm, _BY_FAMILY)
-    return _parsed(task, arm, {**by_family.get(family, {}), **changes})
+    family, algorithm = task_spec(task).family, _algorithm(changes)
+    by_family = {"maddpg": _MADDPG_BY_FAMILY, "qmix": _QMIX_BY_FAMILY}.get(algorithm, _BY_FAMILY)
+    return _parsed(task, algorithm, {**by_family.get(family, {}), **changes})
 
 
-def _parsed(task: str, arm: str, values: dict[str, Any]) -> AnySettings:
-    if arm not in ARMS:
-        raise SpecError(f"training {task}: no arm {arm!r}{hint(str(arm), ARMS)}")
+def _algorithm(changes: Mapping[str, Any]) -> str:
+    """The algorithm's own name, where one of its synonyms may have been given."""
+    name = str(changes.get("algorithm", "min_health"))
+    return SYNONYMS.get(name, name)
+
+
+def _parsed(task: str, algorithm: str, values: dict[str, Any]) -> AnySettings:
+    if algorithm not in ALGORITHMS:
+        raise SpecError(f"training {task}: no algorithm {algorithm!r}{hint(algorithm, ALGORITHMS)}")
     every = _EPISODES_PER_TRIAL * task_spec(task).horizon
-    return parse(ARMS[arm], {"task": task, "arm": arm, "eval_every": every, **values}, f"training {task}")
+    return parse(
+        ALGORITHMS[algorithm],
+        {"task": task, "eval_every": every, **values, "algorithm": algorithm},
+        f"training {task}",
+    )
 
 
 _PAPER: dict[str, Any] = {
-    "steps": 2_500_000, "epochs": 8, "minibatches": 8, "gamma": 0.95, "lam": 1.0, "entropy": 0.01,
-    "critic_rate": 5e-3, "target_kl": None, "max_grad_norm": 0.5, "std": 1.0,
+    "steps": 2_500_000, "epochs": 8, "minibatches": 8, "gamma": 0.95, "gae_lambda": 1.0, "entropy_coef": 0.01,
+    "critic_rate": 5e-3, "target_kl": None, "max_grad_norm": 0.5, "initial_std": 1.0,
     "actor_hidden": (64, 64), "critic_hidden": (64,) * 8,
-    "mask_dead": False, "zero_dead_actions": True, "psi_over": "minibatch", "value_clip": 0.2,
+    "mask_dead": False, "zero_dead_actions": True, "advantage_norm": "minibatch", "value_clip": 0.2,
     "normalize_inputs": False, "normalize_returns": False, "bootstrap_truncation": False,
 }  # fmt: skip
-_PAPER_ARMS: Mapping[str, dict[str, Any]] = {
+_PAPER_ALGORITHMS: Mapping[str, dict[str, Any]] = {
     "local": {"critic_hidden": (64, 64), "critic_rate": 1e-3},
     "central": {},
-    "min_health": {"psi_over": "batch"},
+    "min_health": {"advantage_norm": "batch"},
 }
 _PAPER_WALKERS: dict[str, Any] = {
     "steps": 5_000_000, "num_envs": 128, "rollout": 128, "epochs": 32, "minibatches": 4, "gamma": 0.99,
-    "entropy": 0.0, "clip": 0.3, "actor_rate": 3e-4, "critic_rate": 3e-4, "value_clip": 10.0,
+    "entropy_coef": 0.0, "clip": 0.3, "actor_rate": 3e-4, "critic_rate": 3e-4, "value_clip": 10.0,
     "max_grad_norm": 1e6,
 }  # fmt: skip
 
 
 _PAPER_MADDPG: dict[str, Any] = {
     "steps": 2_500_000, "gamma": 0.95, "batch": 1024, "buffer": 1_000_000, "learning_starts": 51_200,
-    "update_every": 100, "rate": 1e-2, "max_grad_norm": 0.5, "target_share": 0.01, "hidden": (64, 64),
-    "critic_hidden": (64, 64), "critic_sees": "observations", "saturation": 1e-3,
+    "update_every": 100, "rate": 1e-2, "max_grad_norm": 0.5, "tau": 0.01, "hidden": (64, 64),
+    "critic_hidden": (64, 64), "critic_sees": "observations", "pretanh_l2": 1e-3,
     "mask_dead": False, "normalize_inputs": False,
 }  # fmt: skip
 _PAPER_QMIX: dict[str, Any] = {
     "steps": 5_000_000, "gamma": 0.99, "batch": 100, "buffer": 100_000, "learning_starts": 1000,
-    "update_every": 100, "rate": 5e-4, "max_grad_norm": 10.0, "target_share": 0.2, "hidden": (64, 64),
+    "update_every": 100, "rate": 5e-4, "max_grad_norm": 10.0, "tau": 0.2, "hidden": (64, 64),
     "bins": 8, "mixer_width": 32, "epsilon": 0.02, "epsilon_steps": 10_000,
     "mask_dead": False, "normalize_inputs": False,
 }  # fmt: skip
@@ -344,16 +358,16 @@ def paper(task: str, **changes: Any) -> AnySettings:
 
     Raises:
         UnknownNameError: no such task.
-        SpecError: no such arm, or a setting that is not allowed.
+        SpecError: no such algorithm, or a setting that is not allowed.
     """
-    spec, arm = task_spec(task), changes.get("arm", "min_health")
-    if arm == "maddpg":
-        reach = 1.0 if spec.clip_actions else 5.0
-        return _parsed(task, arm, {**_PAPER_MADDPG, "reach": reach, **changes})
-    if arm == "qmix":
-        return _parsed(task, arm, {**_PAPER_QMIX, **changes})
+    spec, algorithm = task_spec(task), _algorithm(changes)
+    if algorithm == "maddpg":
+        action_scale = 1.0 if spec.clip_actions else 5.0
+        return _parsed(task, algorithm, {**_PAPER_MADDPG, "action_scale": action_scale, **changes})
+    if algorithm == "qmix":
+        return _parsed(task, algorithm, {**_PAPER_QMIX, **changes})
     walkers = _PAPER_WALKERS if spec.family == "multiwalker" else {}
-    return _parsed(task, arm, {**_PAPER, **walkers, **_PAPER_ARMS.get(arm, {}), **changes})
+    return _parsed(task, algorithm, {**_PAPER, **walkers, **_PAPER_ALGORITHMS.get(algorithm, {}), **changes})
 
 
 PRESETS: Mapping[str, Callable[..., AnySettings]] = {"recommended": recommended, "paper": paper}

@@ -4,13 +4,13 @@ A sweep file lists groups of runs::
 
     [[run]]
     tasks = ["hazard_nav-4", "hazard_nav-8"]
-    arms = ["min_health", "central"]
+    algorithms = ["min_health", "central"]
     seeds = [0, 1, 2]
     preset = "recommended"        # or "paper"
     settings = { gamma = 0.95 }   # what differs from the preset
     label = "g95"                 # optional, part of the folders' names
 
-Every combination is one run, in the folder ``<out>/<task>/<arm>[-<label>]/seed<k>``.
+Every combination is one run, in the folder ``<out>/<task>/<algorithm>[-<label>]/seed<k>``.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ _PATIENCE = 5.0
 
 
 class Group(Params):
-    """Runs that share everything but task, arm and seed."""
+    """Runs that share everything but task, algorithm and seed."""
 
     tasks: tuple[str, ...] = pydantic.Field(min_length=1)
-    arms: tuple[str, ...] = ("min_health",)
+    algorithms: tuple[str, ...] = ("min_health",)
     seeds: tuple[int, ...] = (0,)
     preset: Literal["recommended", "paper"] = "recommended"
     settings: dict[str, Any] = pydantic.Field(default_factory=dict[str, Any])
@@ -65,7 +65,7 @@ class Run(NamedTuple):
     settings: AnySettings
     out: Path
     command: str
-    arm: str
+    algorithm: str
     """The settings' with the group's label: the folder's name."""
 
     @property
@@ -226,7 +226,7 @@ def _standing(
 def _pace(run: Run, paces: list[tuple[Run, float]]) -> float | None:
     """Seconds per step of the runs that are most like one that has not begun."""
     alike: tuple[Callable[[Run], bool], ...] = (
-        lambda other: (other.settings.task, other.arm) == (run.settings.task, run.arm),
+        lambda other: (other.settings.task, other.algorithm) == (run.settings.task, run.algorithm),
         lambda other: other.settings.task == run.settings.task,
         lambda other: True,
     )
@@ -238,12 +238,12 @@ def _pace(run: Run, paces: list[tuple[Run, float]]) -> float | None:
 
 
 def _runs(group: Group, out: Path) -> Iterator[Run]:
-    for task, arm, seed in itertools.product(group.tasks, group.arms, group.seeds):
-        settings = PRESETS[group.preset](task, **{"arm": arm, "seed": seed, **group.settings})
-        labelled = f"{arm}-{group.label}" if group.label else arm
+    for task, algorithm, seed in itertools.product(group.tasks, group.algorithms, group.seeds):
+        settings = PRESETS[group.preset](task, **{"algorithm": algorithm, "seed": seed, **group.settings})
+        labelled = f"{algorithm}-{group.label}" if group.label else algorithm
         folder = out / task / labelled / f"seed{seed}"
         changed = [f"--set {name}={json.dumps(value)}" for name, value in group.settings.items()]
-        options = [f"--task {task} --arm {arm} --preset {group.preset} --seed {seed}", *changed]
+        options = [f"--task {task} --algorithm {algorithm} --preset {group.preset} --seed {seed}", *changed]
         yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]), labelled)
 
 

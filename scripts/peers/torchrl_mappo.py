@@ -56,9 +56,9 @@ class Mappo:
             ["state"],
             [VALUE],
         )
-        self.loss = MAPPOLoss(actor, critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy)
+        self.loss = MAPPOLoss(actor, critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy_coef)
         self.loss.set_keys(value=VALUE, action=ACTION, reward=REWARD)
-        self.loss.make_value_estimator(gamma=settings.gamma, lmbda=settings.lam)
+        self.loss.make_value_estimator(gamma=settings.gamma, lmbda=settings.gae_lambda)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), settings.actor_rate)
         frames = settings.num_envs * settings.rollout
         self.rollouts = iter(Collector(env, actor, frames_per_batch=frames, total_frames=-1))
