@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -82,7 +83,7 @@ def test_evaluate_end_to_end(tmp_path):
     )
     done = run(*args, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    # not a terminal: no progress bars
+    # not a terminal: no progress bars, and the first plain line comes after 30 s
     assert done.stderr == ""
     (folder,) = (tmp_path / "runs").iterdir()
     assert folder.name.startswith("random-")
@@ -179,17 +180,21 @@ def test_without_graphics_the_scores_still_come(tmp_path):
 @pytest.mark.skipif(gl.working_backend() is None, reason="no OpenGL here")
 def test_interrupted_while_filming_leaves_no_half_film(tmp_path):
     args = ("evaluate", "--agent", "zero", "--tasks", TASK, "--episodes", 3, "--out", tmp_path)
-    child = subprocess.Popen(command(*args), stderr=subprocess.PIPE, text=True)
+    child = subprocess.Popen(command(*args), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     videos, until = tmp_path / "videos", time.monotonic() + 60
     while not (videos.exists() and list(videos.iterdir())):
         assert child.poll() is None, child.stderr.read()
         assert time.monotonic() < until
         time.sleep(0.01)
     os.kill(child.pid, signal.SIGINT)
-    _, said = child.communicate(timeout=60)
+    told, said = child.communicate(timeout=60)
     assert child.returncode == 130
     assert "Traceback" not in said
     assert list(videos.iterdir()) == []
+    # the scores were told before, and are kept
+    assert re.search(rf"^{TASK} +-?\d", told, re.MULTILINE)
+    assert json.loads((tmp_path / "results.json").read_text())["film_trouble"] == ["interrupted"]
+    assert "resumes" in said
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):

@@ -90,8 +90,63 @@ def test_the_comparison_is_printed(folders):
         app, ["compare", str(folders / "random-standard"), str(folders / "zero-standard")]
     )
     assert done.exit_code == 0, done.output
-    assert "P(improvement)" in done.output
+    assert "one run of each: the first scores higher on" in done.output
+    assert "P(improvement)" not in done.output
     # neither is trained, so neither has a place
     assert done.output.count("reference") == 2
     for task in TASKS:
         assert task in done.output
+
+
+def evaluated(agent, tasks, out, episodes=3):
+    suite = runner.Suite("custom", tuple(task_spec(task) for task in tasks))
+    return runner.evaluate(load_agent(agent), suite, out, Plan(episodes=episodes, threads=1))
+
+
+def test_only_tasks_in_common_are_ranked(folders, tmp_path):
+    """The score of what both played is that of an evaluation of those tasks alone."""
+    evaluated("zero", ("coop_nav-3", "paper_coop_nav-3"), tmp_path / "zero")
+    alone = {
+        name: evaluated(name, ("coop_nav-3",), tmp_path / f"{name}-alone")["aggregate"]
+        for name in ("random", "zero")
+    }
+    found = comparing.on_common_tasks({"random": folders / "random-standard", "zero": tmp_path / "zero"})
+    for name, results in found.items():
+        assert [task["task"] for task in results["tasks"]] == ["coop_nav-3"]
+        assert results["aggregate"] == alone[name]
+    done = CliRunner().invoke(app, ["compare", str(folders / "random-standard"), str(tmp_path / "zero")])
+    assert "ranked on what all played: coop_nav-3\n" in done.output
+    assert "paper_coop_nav-3" not in done.output
+
+    evaluated("zero", ("paper_coop_nav-3",), tmp_path / "other")
+    with pytest.raises(HipgError, match="no scored task was played by all"):
+        comparing.on_common_tasks({"a": folders / "random-standard", "b": tmp_path / "other"})
+
+
+def test_several_runs_have_a_chance_of_improvement(tmp_path):
+    from hipg_bench.cli.compare import _verdict
+
+    def side(*scores):
+        runs = [{"score": score} for score in scores]
+        return {
+            "tasks": [{"task": "t", "score": np.mean(scores), "runs": runs}], "aggregate": {"scored": ["t"]},
+        }  # fmt: skip
+
+    # 5 of the 6 pairs have the first above the second
+    assert _verdict(side(0.9, 0.5, 0.7), side(0.6, 0.1)).startswith("P(improvement) 0.83")
+    assert "higher on 1 of 1 tasks" in _verdict(side(0.9), side(0.6))
+
+
+def test_agents_are_evaluated_where_the_others_were(folders, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    args = ["compare", "scripted", str(folders / "zero-standard")]
+    for _ in range(2):
+        done = CliRunner().invoke(app, args, catch_exceptions=False)
+        assert done.exit_code == 0
+    (folder,) = (tmp_path / "runs").iterdir()  # the second time it was there already
+    results = json.loads((folder / "results.json").read_text())
+    assert [task["task"] for task in results["tasks"]] == list(TASKS)
+    assert (results["episodes_per_policy"], results["seed"], results["split"]) == (3, 1000, "standard")
+    assert "higher on 2 of 2 tasks" in done.output
+    for wrong in (["zero"], ["zero", "zero"], ["zero", "nobody"], ["zero", str(tmp_path)]):
+        assert isinstance(CliRunner().invoke(app, ["compare", *wrong]).exception, HipgError)

@@ -357,3 +357,26 @@ def test_writing_a_calibration_keeps_the_rest_of_the_file(tmp_path):
     assert tomllib.loads(calibration._without(path.read_text(), ("anchors", "calibration"))) == {
         "params": {"x": 1}
     }
+
+
+def test_scores_are_told_and_written_before_films_and_survive_an_interruption(tmp_path, monkeypatch):
+    spec = task_spec("coop_nav-3")
+    told = []
+
+    def film(*args, **kwargs):
+        results = json.loads((tmp_path / "results.json").read_text())
+        told.append(("film", len(results["tasks"])))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hipg_bench.rendering.film.record", film)
+    with pytest.raises(KeyboardInterrupt):
+        runner.evaluate(
+            load_agent("zero"), runner.Suite("custom", (spec,)), tmp_path, Plan(episodes=2, threads=1),
+            films_per_task=1,
+            played_task=lambda task: told.append(("task", task["task"])),
+            scored=lambda results: told.append(("scored", results["aggregate"]["tasks"])),
+        )  # fmt: skip
+    assert told == [("task", "coop_nav-3"), ("scored", 1), ("film", 1)]
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert (results["films"], results["film_trouble"]) == ([], ["interrupted"])
+    assert "interrupted" in (tmp_path / "report.html").read_text()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import threading
 import unicodedata
+from collections.abc import Generator
 from types import TracebackType
 from typing import Any
 
@@ -40,6 +42,14 @@ def progress() -> Progress:
     )
 
 
+@contextlib.contextmanager
+def paused(bars: Progress) -> Generator[None]:
+    """Take a progress display away while results are printed."""
+    bars.stop()
+    yield
+    bars.start()
+
+
 class _PlainProgress(Progress):
     """Progress as plain lines, so that the log of a job is never silent for minutes."""
 
@@ -56,6 +66,12 @@ class _PlainProgress(Progress):
         """Print no more lines."""
         self._stopped.set()
         self._printer.join()
+
+    def start(self) -> None:
+        """Show nothing that is drawn over."""
+
+    def stop(self) -> None:
+        """See `start`."""
 
     def _print_lines(self) -> None:
         while not self._stopped.wait(PLAIN_SECONDS):

@@ -71,27 +71,76 @@ def evaluate(
     parts = {name: folder / name for name in splits.SPLITS} if split == "all" else {split: folder}
     every: dict[str, Any] = {}
     for name, part in parts.items():
-        every[name] = _evaluate(who, suite, part, dataclasses.replace(plan, split=name), films)
-        if not as_json:
-            _print(every[name], part)
+        split_plan = dataclasses.replace(plan, split=name)
+        every[name] = _evaluate(who, suite, part, split_plan, films, silent=as_json)
     if as_json:
         console.show_json(every if split == "all" else every[split])
 
 
-def _evaluate(who: Agent, suite: Suite, folder: Path, plan: Plan, films: int) -> dict[str, Any]:
-    """One split, with a bar for each task."""
+def _evaluate(
+    who: Agent, suite: Suite, folder: Path, plan: Plan, films: int, *, silent: bool
+) -> dict[str, Any]:
+    """One split, with a bar for each task; scores are printed as they come, and before the films."""
     from hipg_bench.evaluation import runner
 
-    seeds, _ = runner.playable(who, suite, plan.split)
+    seeds, skipped = runner.playable(who, suite, plan.split)
+    if not silent:
+        console.say(f"{who.name} on {suite.name}, {plan.split}: {who.summary}\n")
+        console.say(_line("task", "score", "", "return", "survival", "deaths", "ended by"))
     with console.progress() as bars:
         totals = {task: plan.episodes * len(found) for task, found in seeds.items()}
         if films:
             totals["films"] = films * len(seeds)
         ids = {name: bars.add_task(name, total=total) for name, total in totals.items()}
-        return runner.evaluate(
-            who, suite, folder, plan, films_per_task=films,
-            progress=lambda stage, done: bars.advance(ids[stage], done) if stage in ids else None,
-        )  # fmt: skip
+
+        def played(task: dict[str, Any]) -> None:
+            with console.paused(bars):
+                console.say(_scores(task))
+
+        def scored(results: dict[str, Any]) -> None:
+            with console.paused(bars):
+                for task, reason in skipped.items():
+                    console.say(_line(task, "-", "", "-", "-", "-", reason))
+                _print_summary(results, folder)
+
+        try:
+            results = runner.evaluate(
+                who, suite, folder, plan, films_per_task=films,
+                progress=lambda stage, done: bars.advance(ids[stage], done) if stage in ids else None,
+                played_task=runner.unheard if silent else played, scored=runner.unheard if silent else scored,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            if (folder / "results.json").is_file():
+                console.warn(f"hipg-bench: the same command with --out {folder} resumes")
+            raise
+    for trouble in results["film_trouble"]:
+        console.warn(f"no film: {trouble}")
+    if films and not silent:
+        console.say(f"{len(results['films'])} films in {folder / 'videos'}")
+    return results
+
+
+_WIDTHS = (20, -6, -14, -8, -8, -6, 1)
+"""Of a line's cells; negative ones are aligned to the right."""
+
+
+def _line(*cells: str) -> str:
+    """Cells as a line of the table, which is printed row by row."""
+    padded = (
+        cell.rjust(-width) if width < 0 else cell.ljust(width)
+        for cell, width in zip(cells, _WIDTHS, strict=True)
+    )
+    return "  ".join(padded).rstrip()
+
+
+def _scores(task: dict[str, Any]) -> str:
+    """What came of a task, as a line of the table."""
+    number, interval = console.number, console.interval
+    return _line(
+        task["task"], number(task["score"]), interval(task["score_ci95"]), number(task["return_mean"], 1),
+        f"{100 * task['survival']:.0f} %", number(task["deaths"]),
+        ", ".join(f"{reason} {count}" for reason, count in task["end_reasons"].items()),
+    )  # fmt: skip
 
 
 def suite_of(tasks: str, num_agents: int | None = None, changes: list[str] | None = None) -> Suite:
@@ -115,21 +164,9 @@ def suite_of(tasks: str, num_agents: int | None = None, changes: list[str] | Non
     return Suite("custom" if own else name, specs)
 
 
-def _print(results: dict[str, Any], folder: Path) -> None:
-    """The table at the end."""
+def _print_summary(results: dict[str, Any], folder: Path) -> None:
+    """What stands below the table."""
     number, interval = console.number, console.interval
-    rows = console.table("task", ">score", "", ">return", ">survival", ">deaths", "ended by")
-    for task in results["tasks"]:
-        rows.add_row(
-            task["task"], number(task["score"]), interval(task["score_ci95"]),
-            number(task["return_mean"], 1), f"{100 * task['survival']:.0f} %", number(task["deaths"]),
-            ", ".join(f"{reason} {count}" for reason, count in task["end_reasons"].items()),
-        )  # fmt: skip
-    for task in results["skipped"]:
-        rows.add_row(task["task"], "-", "", "-", "-", "-", task["reason"])
-    what = f"{results['suite']}, {results['split']}"
-    console.say(f"{results['agent']} on {what}: {results['agent_summary']}\n")
-    console.show(rows)
     whole = results["aggregate"]
     if whole["score_iqm"] is not None:
         zero = (
@@ -143,11 +180,8 @@ def _print(results: dict[str, Any], folder: Path) -> None:
         )
     for task in results["tasks"]:
         if task["score"] is None:
-            console.say(
-                f"no score on {task['task']}, which has no score scale yet: {calibrate_hint(task['task'])}"
-            )
+            name = task["task"]
+            console.say(f"no score on {name}, which has no score scale yet: {calibrate_hint(name)}")
     if results["episodes_per_policy"] < 320:
         console.say(f"{results['episodes_per_policy']} episodes per policy: not for comparison")
-    for trouble in results["film_trouble"]:
-        console.warn(f"no film: {trouble}")
     console.say(f"\n{folder / 'report.html'}")

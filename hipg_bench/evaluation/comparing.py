@@ -9,15 +9,16 @@ from typing import Any, Literal
 import numpy as np
 import pydantic
 
+from hipg_bench import registry
 from hipg_bench.documents import read_json
 from hipg_bench.errors import HipgError
 from hipg_bench.evaluation.episodes import Row
-from hipg_bench.evaluation.results import SCHEMA
+from hipg_bench.evaluation.results import SCHEMA, aggregate
 from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.evaluation.statistics import Interval, paired_difference
 from hipg_bench.paths import check_seal
 from hipg_bench.registry import task_spec
-from hipg_bench.spec import parse
+from hipg_bench.spec import Anchors, TaskSpec, parse
 
 _SAME = ("split", "seed", "commitment", "episodes_per_policy")
 """What two evaluations must share, so that they met the same worlds."""
@@ -55,13 +56,17 @@ class _Results(_Document):
     kind: Literal["method", "checkpoint", "reference"]
     aggregate: _Aggregate
     tasks: tuple[_Task, ...]
+    own_tasks: dict[str, dict[str, Any]] = {}
 
 
 def read(folder: Path) -> dict[str, Any]:
     """What ``results.json`` of a finished evaluation holds.
 
+    Tasks in it that are none of the benchmark's are known in this process from then on.
+
     Raises:
-        HipgError: there is none, it is damaged, or of another schema.
+        HipgError: there is none, it is damaged, or of another schema, or another task has the name of one of
+            its own.
     """
     path = folder / "results.json"
     if not path.is_file():
@@ -70,7 +75,50 @@ def read(folder: Path) -> dict[str, Any]:
     if results.get("schema") != SCHEMA:
         raise HipgError(f"{path}: schema {SCHEMA} is allowed, got {results.get('schema')}: evaluate again")
     parse(_Results, results, str(path))
+    for task, spec in results.get("own_tasks", {}).items():
+        registry.add_task(parse(TaskSpec, spec, f"{path}: own_tasks.{task}"))
     return results
+
+
+def on_common_tasks(evaluations: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
+    """Results of several evaluations, each summed up over the scored tasks that all of them played.
+
+    Args:
+        evaluations: name to folder.
+
+    Returns:
+        Name to what ``results.json`` holds, with ``aggregate`` and ``tasks`` of those tasks alone.
+
+    Raises:
+        HipgError: there is no such task, or one of them is no evaluation.
+    """
+    found = {name: read(folder) for name, folder in evaluations.items()}
+    scored = [
+        {task["task"]: task["fingerprint"] for task in results["tasks"] if task["score"] is not None}
+        for results in found.values()
+    ]
+    common = [
+        task
+        for task, fingerprint in scored[0].items()
+        if all(other.get(task) == fingerprint for other in scored)
+    ]
+    if not common:
+        raise HipgError(f"no scored task was played by all of {', '.join(evaluations)}, in the same version")
+    for name, folder in evaluations.items():
+        results = found[name]
+        tasks = {task["task"]: task for task in results["tasks"]}
+        whole = [tasks[task] for task in common]
+        played = [
+            (_anchored(task_spec(task["task"]), task["anchors"]), rows_of(folder, task["task"]))
+            for task in whole
+        ]
+        found[name] = results | {"suite": "common", "tasks": whole, "aggregate": aggregate(played)}
+    return found
+
+
+def _anchored(spec: TaskSpec, anchors: Mapping[str, Any]) -> TaskSpec:
+    """The task on the scale that an evaluation used."""
+    return spec.model_copy(update={"anchors": parse(Anchors, dict(anchors), spec.task)})
 
 
 def rows_of(folder: Path, task: str) -> list[Row]:

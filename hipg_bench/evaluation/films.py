@@ -115,11 +115,11 @@ def choose(
     return chosen
 
 
-def make(films: Sequence[Film], advance: Callable[[float], None]) -> tuple[list[Film], list[str]]:
+def make(films: Sequence[Film], advance: Callable[[float], None]) -> list[str]:
     """Render what is not yet rendered.
 
     Returns:
-        The films there are, and what went wrong with the others.
+        What went wrong with those that are still missing.
     """
     waiting = [one for one in films if not one.video.exists()]
     advance(len(films) - len(waiting))
@@ -139,7 +139,7 @@ def make(films: Sequence[Film], advance: Callable[[float], None]) -> tuple[list[
         finally:
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
-    return [one for one in films if one.video.exists()], list(dict.fromkeys(trouble))
+    return list(dict.fromkeys(trouble))
 
 
 def _make_one(one: Film, stop: threading.Event, advance: Callable[[float], None]) -> None:

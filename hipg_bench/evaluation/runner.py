@@ -20,6 +20,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hipg_bench import registry
 from hipg_bench.documents import read_json
 from hipg_bench.errors import BundleError, ResumeError, SpecError, UnknownNameError
 from hipg_bench.evaluation import films, protocol, report, splits
@@ -57,6 +58,14 @@ def quiet(stage: str, done: float) -> None:
     """Tell nobody."""
 
 
+Report = Callable[[dict[str, Any]], None]
+"""Told what ``results.json`` says of a task, or all of it."""
+
+
+def unheard(results: dict[str, Any]) -> None:
+    """Tell nobody."""
+
+
 def playable(
     agent: Agent, suite: Suite, split: str = splits.STANDARD
 ) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
@@ -89,7 +98,15 @@ def playable(
 
 
 def evaluate(
-    agent: Agent, suite: Suite, out: Path, plan: Plan, *, films_per_task: int = 0, progress: Progress = quiet
+    agent: Agent,
+    suite: Suite,
+    out: Path,
+    plan: Plan,
+    *,
+    films_per_task: int = 0,
+    progress: Progress = quiet,
+    played_task: Report = unheard,
+    scored: Report = unheard,
 ) -> dict[str, Any]:
     """Score an agent.
 
@@ -100,6 +117,9 @@ def evaluate(
         plan: which worlds.
         films_per_task: how many episodes are filmed; the first is the median one.
         progress: told how far it is.
+        played_task: told the entry of ``tasks`` in ``results.json`` as soon as a task is played.
+        scored: told all results before the films are begun. They and the report are on disk by then, and stay
+            if the films are interrupted, together with those that were finished.
 
     Returns:
         What ``results.json`` holds.
@@ -122,11 +142,10 @@ def evaluate(
                 watches[spec.task] = watch = Stopwatch()
                 with _timed(seconds, spec.task):
                     rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, watch, progress)
+                played_task(summarise(spec, rows[spec.task]))
         played = [spec for spec in specs if spec.task in rows]
-        with _timed(seconds, "films"):
-            chosen, trouble = films.choose_all(agent, played, rows, plan, films_per_task, out)
-            made, more_trouble = films.make(chosen, lambda done: progress("films", done))
-        results = {
+        own = [spec for spec in played if spec.task not in registry.tasks()]
+        results: dict[str, Any] = {
             "schema": SCHEMA,
             "suite": suite.name,
             "split": plan.split,
@@ -142,24 +161,63 @@ def evaluate(
             "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in specs]),
             "tasks": [summarise(spec, rows[spec.task]) for spec in played],
             "skipped": [{"task": task, "reason": reason} for task, reason in skipped.items()],
-            "films": [{"task": one.spec.task, "file": one.file, "title": one.title} for one in made],
-            "film_trouble": [*trouble, *more_trouble],
+            "films": [],
+            "film_trouble": [],
             "timing": {
                 "seconds": seconds,
                 "act_ms": {task: watch.summary() for task, watch in watches.items()},
             },
         }
-        write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
-        write_text(out / "report.html", report.render(results, rows, {spec.task: spec for spec in played}))
+        if own:
+            results["own_tasks"] = {spec.task: spec.model_dump(mode="json") for spec in own}
+
+        def write() -> None:
+            write_text(out / "results.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
+            page = report.render(results, rows, {spec.task: spec for spec in played})
+            write_text(out / "report.html", page)
+
+        write()
+        scored(results)
+        if films_per_task:
+            try:
+                with _timed(seconds, "films"):
+                    _film(agent, played, rows, plan, films_per_task, out, results, progress)
+            finally:
+                write()
         return results
+
+
+def _film(
+    agent: Agent,
+    specs: Sequence[TaskSpec],
+    rows: Mapping[str, Sequence[Row]],
+    plan: Plan,
+    count: int,
+    out: Path,
+    results: dict[str, Any],
+    progress: Progress,
+) -> None:
+    """Make the films and enter them in the results; those that are finished, where it is interrupted."""
+    chosen, trouble = films.choose_all(agent, specs, rows, plan, count, out)
+    results["film_trouble"] = [*trouble, "interrupted"]
+    try:
+        results["film_trouble"] = [*trouble, *films.make(chosen, lambda done: progress("films", done))]
+    finally:
+        results["films"] = [
+            {"task": one.spec.task, "file": one.file, "title": one.title}
+            for one in chosen
+            if one.video.exists()
+        ]
 
 
 @contextlib.contextmanager
 def _timed(seconds: dict[str, float], name: str) -> Generator[None]:
-    """Note how long a block took."""
+    """Note how long a block took, also one that is interrupted."""
     started = time.perf_counter()
-    yield
-    seconds[name] = round(time.perf_counter() - started, 3)
+    try:
+        yield
+    finally:
+        seconds[name] = round(time.perf_counter() - started, 3)
 
 
 def _play_task(

@@ -53,10 +53,11 @@ class TensorBoard:
     def __init__(self, folder: Path, settings: Mapping[str, Any], steps: int) -> None:
         """Begin, or resume after so many environment steps: what was logged beyond them is withdrawn."""
         self._writer = SummaryWriter(str(folder), purge_step=steps + 1 if steps else None)
-        if steps == 0:
+        events = self._writer.file_writer
+        if steps == 0 and events is not None:
             metrics = dict.fromkeys((tag("score"), tag("eval_return")), 0.0)
             for summary in hparams(_flat(settings), metrics):
-                self._writer.file_writer.add_summary(summary)  # add_hparams makes a folder of its own
+                events.add_summary(summary)  # add_hparams makes a folder of its own
 
     def log(self, values: Mapping[str, float], steps: int) -> None:
         """See `Tracker`."""
