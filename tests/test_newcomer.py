@@ -29,17 +29,34 @@ def desk(tmp_path_factory):
         pytest.importorskip(needed)
     folder = tmp_path_factory.mktemp("newcomer")
     (folder / "examples").symlink_to(ROOT / "examples")
+    return folder, run_in_a_checkout(folder, COMMANDS, tmp_path_factory.mktemp("home"))
+
+
+def run_in_a_checkout(folder, blocks, home):
+    """What blocks of commands print, one after the other, in a folder under version control."""
+    (folder / ".git").mkdir()
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     said = []
-    for block in COMMANDS:
+    for block in blocks:
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", block], cwd=folder, timeout=600,
             capture_output=True, text=True, check=False,
-            env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1",
+                 "HOME": str(home)},
         )  # fmt: skip
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
         said.append(done.stdout)
-    return folder, said
+    return said
+
+
+def test_the_readme_leads_from_a_training_to_a_verified_entry(tmp_path):
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"## Enter the leaderboard\n```sh\n(.*?)```", readme, re.DOTALL)
+    (checkout := tmp_path / "checkout").mkdir()
+    (home := tmp_path / "home").mkdir()
+    (said,) = run_in_a_checkout(checkout, [block], home)
+    assert "my_agent: verified, decentralised" in said
+    assert "my_agent" in (checkout / "site" / "index.html").read_text(encoding="utf-8")
 
 
 def test_the_page_goes_the_whole_way():

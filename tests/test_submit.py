@@ -3,6 +3,7 @@
 import json
 import re
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from typer.testing import CliRunner
 
 from hipg_bench import make, task_spec
 from hipg_bench.cli import app
-from hipg_bench.errors import BundleError
+from hipg_bench.errors import BundleError, UnknownNameError
+from hipg_bench.learning.run import train
+from hipg_bench.learning.settings import recommended
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.card import read_card
 from hipg_bench.policies.export import export_sequential
@@ -66,6 +69,53 @@ def change(path, old, new):
     path.write_text(text.replace(old, new))
 
 
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A short training run of seed 3."""
+    out = tmp_path_factory.mktemp("run") / "coop"
+    settings = recommended("coop_nav-3", steps=64, num_envs=4, rollout=8, seed=3)
+    train(settings, out, command="hipg-bench train --task coop_nav-3 ...")
+    return out
+
+
+def test_a_training_run_becomes_an_agent_that_passes(run_folder, tmp_path):
+    folder = tmp_path / "mine"
+    init(folder, 0, authors="Ada Lovelace", license="MIT", runs=[run_folder])
+    assert [one.where for one in check(folder) if one.severity == "error"] == []
+    agent = load_agent(folder)
+    assert (agent.tasks, agent.train_seeds("coop_nav-3")) == (("coop_nav-3",), (3,))
+    assert agent.card.training.env_steps == 64
+    assert (folder / "coop_nav-3/seed3.safetensors").read_bytes() == (
+        run_folder / "policy.safetensors"
+    ).read_bytes()
+    assert "hipg-bench train --task coop_nav-3 ..." in (folder / "README.md").read_text()
+
+
+def test_runs_that_make_no_agent_are_refused_and_leave_nothing(run_folder, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for tier, runs, message in (
+        (1, [run_folder], "of tier 0, got tier 1"),
+        (0, [run_folder, run_folder], "same task and seed"),
+        (0, [tmp_path / "empty"], "train.json"),
+        (0, [tmp_path / "none"], "no such file or folder"),
+        (0, [run_folder / "policy.safetensors", "random"], "no folder of a training run"),
+    ):
+        with pytest.raises((BundleError, UnknownNameError), match=message):
+            init(tmp_path / "mine", tier, runs=[Path(run) for run in runs])
+        assert not (tmp_path / "mine").exists()
+
+
+def test_the_next_steps_are_those_that_are_left(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = CliRunner().invoke(app, ["submit", "init", "fresh", "--license", "MIT"]).output
+    steps = [line for line in said.splitlines() if line[0].isdigit()]
+    assert len(steps) == 5
+    assert "fill in authors, summary" in steps[1]
+    # what the steps name is what `check` finds
+    wrong = {finding.where for finding in check(tmp_path / "fresh") if finding.severity == "error"}
+    assert wrong == {"agent.toml: authors", "agent.toml: summary", "README.md", "tasks"}
+
+
 def test_a_filled_template_of_tier_0_passes_and_is_packed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = CliRunner()
@@ -73,7 +123,8 @@ def test_a_filled_template_of_tier_0_passes_and_is_packed(tmp_path, monkeypatch)
         app, ["submit", "init", "my_agent", "--authors", "A 'B' \"C\"", "--license", "MIT", "--summary", "s"]
     )
     assert made.exit_code == 0, made.output
-    assert "next: write my_agent/<task>/seed<k>.safetensors" in made.output
+    assert "1. write <task>/seed<k>.safetensors into my_agent" in made.output
+    assert "fill in" not in made.output
     before = run.invoke(app, ["submit", "pack", "my_agent"])
     assert before.exit_code == 1
     assert "README.md: still says TODO" in before.output

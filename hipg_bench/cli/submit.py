@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import quoted
 
 if TYPE_CHECKING:
     from hipg_bench.submissions.findings import Finding
@@ -33,14 +35,46 @@ def init(
     authors: Annotated[str, typer.Option(help="Whom to thank.")] = "",
     license: Annotated[str, typer.Option(help="Such as MIT or Apache-2.0.")] = "",
     summary: Annotated[str, typer.Option(help="One sentence.")] = "",
+    from_run: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A training run of `hipg-bench train`, whose policy it gets; may be repeated for others."
+        ),
+    ] = None,
 ) -> None:
-    """Make a folder to be filled in."""
+    """Make an agent's folder: of training runs, or to be filled in."""
     from hipg_bench.submissions.init import init as make
 
-    for path in make(name, tier, authors=authors, license=license, summary=summary):
+    runs = from_run or []
+    for path in make(name, tier, authors=authors, license=license, summary=summary, runs=runs):
         console.say(str(path))
-    weights = f"{name}/<task>/seed<k>" + (".safetensors", ".onnx", ".npz")[tier]
-    console.say(f"next: write {weights}, then: hipg-bench submit check {name}")
+    for k, step in enumerate(_next_steps(name, tier, bool(runs), authors, license, summary), start=1):
+        console.say(f"{k}. {step}")
+
+
+_WEIGHTS = (
+    "write <task>/seed<k>.safetensors into {name}, such as {name}/hazard_nav-4/seed0.safetensors: "
+    "docs/submit.md shows how; or begin from a training run, with --from-run",
+    "write <task>/seed<k>.onnx into {name}, such as {name}/hazard_nav-4/seed0.onnx: docs/submit.md shows how",
+    "write {name}/agent.py, and name its tasks and training seeds under [tasks] in {name}/agent.toml",
+)
+
+
+def _next_steps(
+    name: Path, tier: int, filled: bool, authors: str, license: str, summary: str
+) -> Iterator[str]:
+    """What is left to do, in order."""
+    word = quoted(name)
+    if not filled:
+        yield _WEIGHTS[tier].format(name=word)
+    fields = {"authors": authors, "license": license, "summary": summary or filled}
+    missing = [field for field, given in fields.items() if not given]
+    if missing:
+        yield f"in {word}/agent.toml fill in {', '.join(missing)}"
+    if not filled:
+        yield f"in {word}/README.md say what it is in place of each TODO"
+    yield f"hipg-bench submit check {word}"
+    yield f"hipg-bench submit pack {word}"
 
 
 @app.command()

@@ -200,7 +200,7 @@ def _print_result(settings: AnySettings, out: Path) -> None:
     if reference in agents() and settings.task in load_agent(reference).tasks:
         console.say(f"  hipg-bench compare {quoted(out)} {reference}")
     if settings.task in tagged("standard"):
-        console.say(f"  hipg-bench submit init my_agent --from-run {quoted(out)}")
+        console.say(f"  hipg-bench submit init my_agent --from-run {quoted(out)} --authors YOU --license MIT")
 
 
 def _train_many(sweep: Path, out: Path, workers: int) -> None:
