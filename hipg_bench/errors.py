@@ -78,7 +78,31 @@ _SHOWN = 120
 
 
 def hint(name: str, allowed: Iterable[str]) -> str:
-    """Return ``"; did you mean 'x'?"`` for the nearest allowed name, else what is allowed."""
+    """Return ``"; did you mean 'x'?"`` for the nearest allowed name, else what is allowed.
+
+    A name also counts as near if only its beginning is: ``mapo`` is nearer to ``mappo_central`` than to
+    ``maddpg``.Names that are equally near are all told, but for
+    those that only go on where another one of them ends.
+    """
     names = sorted(allowed)
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(names)}"
+    nearness = {known: _nearness(name, known) for known in names}
+    best = max(nearness.values(), default=0.0)
+    if best < _NEAR:
+        return f"; there are: {', '.join(names)}"
+    ties = [known for known, value in nearness.items() if value == best]
+    near = [repr(known) for known in ties if not any(known != one and known.startswith(one) for one in ties)]
+    listed = near[0] if len(near) == 1 else f"{', '.join(near[:-1])} or {near[-1]}"
+    return f"; did you mean {listed}?"
+
+
+_NEAR = 0.5
+"""Share of equal characters above which a name is worth telling."""
+
+
+def _nearness(name: str, known: str) -> float:
+    """Share of equal characters of two names, or, which counts less, of one and the other's beginning."""
+    whole = difflib.SequenceMatcher(None, known, name).ratio()
+    beginning = max(
+        difflib.SequenceMatcher(None, known[: len(name) + more], name).ratio() for more in (-1, 0, 1)
+    )
+    return max(whole, 0.95 * beginning)

@@ -73,7 +73,7 @@ def change(path, old, new):
 def run_folder(tmp_path_factory):
     """A short training run of seed 3."""
     out = tmp_path_factory.mktemp("run") / "coop"
-    settings = recommended("coop_nav-3", steps=64, num_envs=4, rollout=8, seed=3)
+    settings = recommended("coop_nav-3", steps=200, num_envs=4, rollout=50, seed=3)
     train(settings, out, command="hipg-bench train --task coop_nav-3 ...")
     return out
 
@@ -84,7 +84,7 @@ def test_a_training_run_becomes_an_agent_that_passes(run_folder, tmp_path):
     assert [one.where for one in check(folder) if one.severity == "error"] == []
     agent = load_agent(folder)
     assert (agent.tasks, agent.train_seeds("coop_nav-3")) == (("coop_nav-3",), (3,))
-    assert agent.card.training.env_steps == 64
+    assert agent.card.training.env_steps == 200
     assert (folder / "coop_nav-3/seed3.safetensors").read_bytes() == (
         run_folder / "policy.safetensors"
     ).read_bytes()

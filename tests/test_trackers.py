@@ -64,7 +64,7 @@ def test_services_get_the_settings_and_every_value_over_steps(name, tmp_path, mo
         finish=lambda: calls.append(("finish",)),
     )
     monkeypatch.setitem(sys.modules, name, fake)
-    settings = {"task": "coop_nav-3", "arm": "min_health", "seed": 0}
+    settings = {"task": "coop_nav-3", "algorithm": "min_health", "seed": 0}
     for _ in range(2):
         service = Service(name, tmp_path, settings)
         service.log({"learner/kl": 0.5}, 32)
@@ -84,4 +84,4 @@ def test_what_is_unknown_or_missing_is_told_before_training(tmp_path, monkeypatc
     assert not (tmp_path / "a").exists()
     monkeypatch.setitem(sys.modules, "trackio", None)
     with pytest.raises(HipgError, match=r"pip install 'hipg-bench\[trackio\]'"):
-        open_trackers(("trackio",), tmp_path, {"task": "", "arm": "", "seed": 0}, 0)
+        open_trackers(("trackio",), tmp_path, {"task": "", "algorithm": "", "seed": 0}, 0)

@@ -1,5 +1,6 @@
 """From a zip to a badge: what is claimed is played again, and hidden worlds give the score."""
 
+import csv
 import hashlib
 import json
 import os
@@ -151,7 +152,8 @@ def test_a_zip_becomes_an_entry(salted):
     (points,) = shown.curves[TASK].values()
     assert len(points) <= adding.CURVE_POINTS
     last = (data_folder("agents") / "mappo_minhealth" / TASK).glob("*.curve.csv")
-    assert points[-1][0] == float(next(last).read_text().splitlines()[-1].split(",")[1])
+    evaluated = [row for row in csv.DictReader(next(last).open()) if row["eval_return"]]
+    assert points[-1] == (float(evaluated[-1]["steps"]), float(evaluated[-1]["eval_return"]))
     assert not list(board.root.rglob(".work"))
 
 
@@ -428,3 +430,32 @@ def test_adding_is_killed_and_two_add_at_once(tmp_path):
     assert board.names() == ("one", "two")
     assert not list(board.root.glob(".hipg-bench-draft*"))
     assert load_agent("zero").name not in board.names()
+
+
+@pytest.mark.parametrize(
+    ("curve", "weights", "kept"),
+    [
+        ("steps,return,eval_return\n1,150,\n2,160,70\n3,170,80\n", {"alive": 0.1}, [(2, 70), (3, 80)]),
+        ("steps,return\n1,150\n2,160\n", {"alive": 0.1}, None),
+        ("steps,return\n1,50\n2,60\n", {}, [(1, 50), (2, 60)]),
+        ("steps,return\n1,50\n2,60\n", None, [(1, 50), (2, 60)]),
+    ],
+)
+def test_returns_with_weights_of_training_are_no_curve(curve, weights, kept, tmp_path):
+    """They are not on the scale of the task's reference, which stands in the same chart."""
+    place = tmp_path / "agent" / TASK
+    place.mkdir(parents=True)
+    (place / "seed0.curve.csv").write_text(curve)
+    if weights is not None:
+        (place / "seed0.json").write_text(json.dumps({"settings": {"weights": weights}}))
+    weights_file = data_folder("agents") / "mappo_minhealth" / TASK / "seed0.safetensors"
+    shutil.copyfile(weights_file, place / "seed0.safetensors")
+    (tmp_path / "agent" / "agent.toml").write_text(
+        'name = "agent"\nsummary = "s"\nkind = "network"\nsuite = "hipg-1"\n'
+    )
+    adding._copy_curves(load_agent(tmp_path / "agent"), tmp_path / "entry")
+    written = tmp_path / "entry" / "curves" / TASK / "seed0.csv"
+    assert written.exists() == (kept is not None)
+    if kept:
+        rows = [tuple(map(float, line.split(","))) for line in written.read_text().splitlines()[1:]]
+        assert rows == kept

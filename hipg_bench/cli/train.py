@@ -96,7 +96,7 @@ def train(
         raise SpecError(f"no preset {preset!r}{hint(preset, PRESETS)}")
     algorithm = SYNONYMS.get(algorithm, algorithm)
     if algorithm not in ALGORITHMS:
-        raise SpecError(f"no algorithm {algorithm!r}{hint(algorithm, ALGORITHMS)}")
+        raise SpecError(f"no algorithm {algorithm!r}{hint(algorithm, [*ALGORITHMS, *SYNONYMS])}")
     pairs = [
         pair for pair in setting or [] if pair.partition("=")[0] not in ALGORITHMS[algorithm].model_fields
     ]

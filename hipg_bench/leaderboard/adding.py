@@ -13,9 +13,10 @@ import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from hipg_bench.errors import BoardError, BundleError
+from hipg_bench.documents import read_json
+from hipg_bench.errors import BoardError, BundleError, SpecError
 from hipg_bench.evaluation.failures import OK
 from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.leaderboard import films
@@ -193,7 +194,8 @@ def _copy_curves(agent: Agent, folder: Path) -> None:
         for seed in agent.train_seeds(task):
             path = agent.folder / task / f"seed{seed}.curve.csv"
             if path.is_file() and path.stat().st_size <= _MOST_CURVE_BYTES:
-                points = list(_points(path))
+                column = _column(path, agent.folder / task / f"seed{seed}.json")
+                points = list(_points(path, column)) if column else []
                 step = math.ceil(len(points) / CURVE_POINTS) or 1
                 # the last point stays
                 lines = [f"{steps:g},{value:.6g}\n" for steps, value in reversed(points[::-1][::step])]
@@ -203,13 +205,29 @@ def _copy_curves(agent: Agent, folder: Path) -> None:
                     )
 
 
-def _points(path: Path) -> Iterator[tuple[float, float]]:
+def _column(curve: Path, record: Path) -> str | None:
+    """The column of a curve whose returns are those that the task pays; None where there is none.
+
+    Returns of periodic evaluations are. Those of training episodes are, unless the record says that
+    training had reward weights of its own: such returns do not belong beside the task's reference.
+    """
+    if next(_points(curve, "eval_return"), None) is not None:
+        return "eval_return"
+    try:
+        settings = read_json(record).get("settings") if record.is_file() else None
+    except (SpecError, OSError):
+        return None
+    shaped = isinstance(settings, dict) and bool(cast(dict[str, Any], settings).get("weights"))
+    return None if shaped else "return"
+
+
+def _points(path: Path, column: str) -> Iterator[tuple[float, float]]:
     """The points of a learning curve that are numbers and go forward."""
     last = -1.0
     with path.open(encoding="utf-8", errors="replace", newline="") as lines, contextlib.suppress(csv.Error):
         for row in csv.DictReader(lines):
             try:
-                steps, value = float(row["steps"]), float(row["return"])
+                steps, value = float(row["steps"]), float(row[column])
             except (KeyError, TypeError, ValueError):
                 continue
             if last < steps <= _LARGEST and abs(value) <= _LARGEST:

@@ -301,7 +301,8 @@ def _algorithm(changes: Mapping[str, Any]) -> str:
 
 def _parsed(task: str, algorithm: str, values: dict[str, Any]) -> AnySettings:
     if algorithm not in ALGORITHMS:
-        raise SpecError(f"training {task}: no algorithm {algorithm!r}{hint(algorithm, ALGORITHMS)}")
+        near = hint(algorithm, [*ALGORITHMS, *SYNONYMS])
+        raise SpecError(f"training {task}: no algorithm {algorithm!r}{near}")
     every = _EPISODES_PER_TRIAL * task_spec(task).horizon
     return parse(
         ALGORITHMS[algorithm],

@@ -20,7 +20,7 @@ from hipg_bench.errors import HipgError, UnknownNameError, hint
 
 _EVALUATION = {"eval_return", "score", "score_low", "score_high"}
 _LEARNER = {
-    "kl", "entropy", "entropy_weight", "actor_rate", "value_loss", "explained", "value", "noise", "epsilon",
+    "kl", "entropy", "entropy_coef", "actor_rate", "value_loss", "explained", "value", "noise", "epsilon",
 }  # fmt: skip
 SERVICES = ("wandb", "trackio")
 """What `open_tracker` knows beside TensorBoard; their functions have the same names."""
@@ -82,7 +82,7 @@ class Service:
             self._module: Any = importlib.import_module(name)
         except ModuleNotFoundError as error:
             raise HipgError(f"--track {name} needs it: pip install 'hipg-bench[{name}]'") from error
-        title = f"{settings['task']}-{settings['arm']}-seed{settings['seed']}"
+        title = f"{settings['task']}-{settings['algorithm']}-seed{settings['seed']}"
         key = f"{title}-{hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]}"
         options = {"id": key, "name": title, "dir": str(out)} if name == "wandb" else {"name": key}
         self._module.init(project=_PROJECT, config=dict(settings), resume="allow", **options)

@@ -143,10 +143,12 @@ def _look_at_record(name: str, path: Path) -> Iterator[Finding]:
     except (ValueError, RecursionError, csv.Error) as trouble:
         yield error(name, f"cannot be read: {trouble}", "write it anew or remove it")
         return
-    missing = {"steps", "return"} - set(columns)
+    missing = [
+        " or ".join(names) for names in (("steps",), ("eval_return", "return")) if not {*names} & {*columns}
+    ]
     if missing:
         yield error(
-            name, f"has no column {', '.join(sorted(missing))}",
+            name, f"has no column {', '.join(missing)}",
             "a learning curve has a row per evaluation with the columns steps (control steps) and return",
         )  # fmt: skip
 
