@@ -28,7 +28,7 @@ evaluate: $(READY) ## score an agent on the standard suite, with films
 test: $(READY) $(READY_FOR_TESTS) ## the tests, some minutes, on all cores; says what was skipped and why
 	$(BIN)/pytest -n $(CORES) --dist loadscope $(ARGS)
 
-test-rllib: ## the RLlib face, in an environment of its own
+test-rllib: ## the RLlib adapter, in an environment of its own
 	scripts/test_beside.sh rllib $(ARGS)
 
 test-benchmarl: ## the BenchMARL plug-in, in an environment of its own
@@ -41,7 +41,7 @@ lint: $(READY) ## style, types, layers, spelling
 	$(BIN)/lint-imports
 	$(BIN)/codespell
 
-format: $(READY) ## mend style where a tool can
+format: $(READY) ## fix style automatically
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -57,11 +57,11 @@ bench-peers: $(READY) ## our speed beside VMAS, JaxMARL, PettingZoo, MaMuJoCo an
 test-long: $(READY) ## what takes long: evaluations killed twenty times, whole suites twice
 	$(BIN)/pytest -m long $(ARGS)
 
-freeze: $(READY) ## after a wanted change: the golden episodes must hold, then the suite version is frozen anew
+freeze: $(READY) ## after a wanted change: the golden episodes must hold, then the suite version is frozen again
 	$(BIN)/pytest tests/test_golden.py --strict-golden
 	$(BIN)/hipg-bench suite freeze
 
-golden: $(READY) ## record the golden episodes anew, after a wanted change of behaviour
+golden: $(READY) ## record the golden episodes again, after a wanted change of behaviour
 	$(BIN)/pytest tests/test_golden.py --record-golden
 
 clean: ## remove caches and builds; the virtual environment and runs/ stay

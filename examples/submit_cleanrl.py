@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Team:
-    """One network for the whole team: N * O numbers in, N * A out, as Gymnasium's face has it."""
+    """One network for the whole team: N * O numbers in, N * A out, as Gymnasium's adapter has it."""
 
     def __init__(self, task: dict, train_seed: int) -> None:
         """Read what training wrote: layers 0, 2 and 4 are linear, with tanh between."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hipg_bench.errors import ActionError, SpecError, shown
+from hipg_bench.errors import ActionError, SpecError, abbreviate
 
 MOST_SEED = 2**64 - 1
 """Largest seed."""
@@ -31,9 +31,9 @@ def whole(value: Any, what: str, low: int, high: int | None = None) -> int:
         value = value[()]
     allowed = f"a whole number from {low} on" if high is None else f"a whole number in {low}..{high}"
     if not isinstance(value, int | np.integer):
-        raise SpecError(f"{what} = {shown(value)} is refused: {allowed} is allowed")
+        raise SpecError(f"{what} = {abbreviate(value)} is refused: {allowed} is allowed")
     if value < low or (high is not None and value > high):
-        raise SpecError(f"{what} = {shown(value)} is refused: {allowed} is allowed")
+        raise SpecError(f"{what} = {abbreviate(value)} is refused: {allowed} is allowed")
     return int(value)
 
 
@@ -67,7 +67,7 @@ def numbers(
     try:
         array = np.asarray(_plain(value))
     except (ValueError, TypeError, RuntimeError) as error:
-        raise ActionError(f"{allowed} {shown(value)}: {error}") from error
+        raise ActionError(f"{allowed} {abbreviate(value)}: {error}") from error
     if array.dtype.kind not in "fiub" or (shape is not None and array.shape != shape):
         raise ActionError(f"{allowed} {array.dtype} of shape {array.shape}")
     return array

@@ -65,16 +65,16 @@ class ResumeError(HipgError, RuntimeError):
     """An output folder that belongs to another run."""
 
 
-def shown(value: object) -> str:
+def abbreviate(value: object) -> str:
     """A value for an error message: short, whatever it is."""
     try:
         text = repr(value)
     except ValueError:  # Python prints no whole number of thousands of digits
         return f"a {type(value).__name__} of thousands of digits"
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
 
 
-_SHOWN = 120
+_LONGEST_VALUE = 120
 
 
 def hint(name: str, allowed: Iterable[str]) -> str:

@@ -85,7 +85,7 @@ def check_seal(path: Path) -> None:
     if seal.exists() and _digest(path) not in seal.read_text(encoding="utf-8", errors="replace").split():
         raise ResumeError(
             f"{path} is damaged or was changed after it was written: its checksum is not in {seal.name}. "
-            f"Restore it, or remove both files to begin it anew"
+            f"Restore it, or remove both files to begin it again"
         )
 
 

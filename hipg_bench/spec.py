@@ -17,7 +17,7 @@ import numpy as np
 import pydantic
 
 from hipg_bench.documents import read_toml
-from hipg_bench.errors import SpecError, hint, shown
+from hipg_bench.errors import SpecError, abbreviate, hint
 
 M = TypeVar("M", bound=pydantic.BaseModel)
 
@@ -138,7 +138,9 @@ class TaskSpec(Params):
                 values[name] = value
             elif name == "weights":
                 if not isinstance(value, Mapping):
-                    raise SpecError(f"{self.task}: weights = {shown(value)} is refused: a mapping is allowed")
+                    raise SpecError(
+                        f"{self.task}: weights = {abbreviate(value)} is refused: a mapping is allowed"
+                    )
                 unknown = set(value) - set(self.weights)
                 if unknown:
                     raise SpecError(
@@ -176,7 +178,9 @@ def _plain(value: Any, what: str) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(one, what) for one in cast(list[Any], value)]
     if not isinstance(value, str | int | float | bool | None):
-        raise SpecError(f"{what} = {shown(value)} is refused: numbers, text and lists of these are allowed")
+        raise SpecError(
+            f"{what} = {abbreviate(value)} is refused: numbers, text and lists of these are allowed"
+        )
     return value
 
 
@@ -196,7 +200,9 @@ def parse(kind: type[M], values: dict[str, Any], where: str) -> M:
             raise SpecError(f"{where}: no field {field!r}{hint(field, kind.model_fields)}") from error
         if first["type"] == "missing":
             raise SpecError(f"{where}: {field} is required and missing") from error
-        raise SpecError(f"{where}: {field} = {shown(first['input'])} is refused: {first['msg']}") from error
+        raise SpecError(
+            f"{where}: {field} = {abbreviate(first['input'])} is refused: {first['msg']}"
+        ) from error
 
 
 def load(path: Path) -> TaskSpec:

@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 
 from hipg_bench import registry
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.foreign import ForeignPolicy
 from hipg_bench.policies.policy import Policy
@@ -93,13 +93,13 @@ SPENT: dict[int, float] = {}
 
 def compare(spec: TaskSpec, here: Policy, inside: ForeignPolicy, rounds: int, worlds: int) -> None:
     """Play the same batch by turns."""
-    plan = Plan(episodes=worlds, num_envs=worlds)
+    job = EvaluationJob(episodes=worlds, num_envs=worlds)
     found: list[list[np.ndarray]] = [[], []]
     results = []
     for k in range(rounds + 1):
         for policy, laps in zip((here, inside), found, strict=True):
             started = clocks()
-            results.append(plan.play_all(spec, policy))
+            results.append(job.play_all(spec, policy))
             if k:  # the first round warms caches
                 laps.append(clocks() - started)
     same = all(rows == results[0] for rows in results)

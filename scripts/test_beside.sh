@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Tests the face of a library that cannot share an environment with the others, in .venv-<name>, which is made
+# Tests the adapter of a library that cannot share an environment with the others, in .venv-<name>, which is made
 # on the first run (a few minutes). What follows the name goes to pytest.
 #
-#   scripts/test_beside.sh rllib         ray pins gymnasium 1.2: our oldest, so its faces are tested here too
-#   scripts/test_beside.sh benchmarl     it pins TorchRL 0.11, whose face is tested here too
+#   scripts/test_beside.sh rllib         ray pins gymnasium 1.2: our oldest, so its adapters are tested here too
+#   scripts/test_beside.sh benchmarl     it pins TorchRL 0.11, whose adapter is tested here too
 #   PYTHON=python3.12 scripts/...        use this Python instead of that of .venv, or the newest one found
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -46,4 +46,4 @@ if [ ! "$venv/.ready" -nt "$pins" ] || [ ! "$venv/.ready" -nt pyproject.toml ]; 
 fi
 
 exec "$venv/bin/python" -m pytest tests/adapters/test_truth_table.py tests/adapters/test_agreement.py \
-    "tests/adapters/test_face_$name.py" "tests/adapters/test_face_$other.py" tests/test_readme.py -k "$name or $other" "$@"
+    "tests/adapters/test_adapter_$name.py" "tests/adapters/test_adapter_$other.py" tests/test_readme.py -k "$name or $other" "$@"

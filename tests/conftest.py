@@ -15,7 +15,7 @@ import pytest  # noqa: E402
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`make golden` records what `make test` compares."""
-    parser.addoption("--record-golden", action="store_true", help="record the golden episodes anew")
+    parser.addoption("--record-golden", action="store_true", help="record the golden episodes again")
     parser.addoption(
         "--strict-golden", action="store_true", help="fail where golden episodes cannot be compared"
     )

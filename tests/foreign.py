@@ -11,7 +11,7 @@ from hipg_bench.policies.foreign import ForeignPolicy
 from hipg_bench.sandbox import choice
 from hipg_bench.sandbox.budget import Budget
 
-WORKING = [name for name, trial in choice.trials().items() if trial.works]
+WORKING = [name for name, result in choice.probe_all().items() if result.works]
 """Sandboxes that work on this machine, the best first."""
 TASK = registry.tasks()["hazard_nav-4"]
 N, SEEN, A = 4, registry.family_of(TASK).layout.observation.size, registry.family_of(TASK).layout.action.size

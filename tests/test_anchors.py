@@ -40,12 +40,12 @@ def test_the_file_says_that_policies_without_eyes_score_little(task: str):
 
 @pytest.mark.parametrize("task", [task for task in STANDARD if task.startswith("hazard")])
 def test_the_file_says_that_the_hazard_matters(task: str):
-    assert task_spec(task).calibration["hazard_leverage"] >= 0.25
+    assert task_spec(task).calibration["hazard_sensitivity"] >= 0.25
 
 
 @pytest.mark.parametrize("task", ANCHORED)
 def test_random_play_still_earns_its_anchor(task: str):
-    """A fresh sample of random episodes, within 4.5 standard errors: whoever changes a task measures anew."""
+    """A fresh sample of random episodes, within 4.5 standard errors."""
     spec, worlds = task_spec(task), 96
     assert spec.anchors
     env, rng = make(task, worlds, seed=11, threads=1), np.random.default_rng(3)
@@ -69,4 +69,4 @@ def test_what_the_file_says_is_measured_again(task: str):
         assert measured.calibration[probe] < 0.2, probe
         assert measured.calibration[probe] == pytest.approx(spec.calibration[probe], abs=0.1)
     if task.startswith("hazard"):
-        assert measured.calibration["hazard_leverage"] >= 0.2
+        assert measured.calibration["hazard_sensitivity"] >= 0.2

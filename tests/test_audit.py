@@ -84,7 +84,7 @@ def test_luck_is_drawn_anew_for_every_repeat() -> None:
     rows = np.repeat(env.rows, 400, axis=0)
     toughness = env.recall(rows, "toughness")
     before = toughness.copy()
-    audit.redraw_luck(env, rows, np.random.default_rng(0))
+    audit.redraw_randomness(env, rows, np.random.default_rng(0))
     assert np.unique(toughness[:, 0]).size == 400
     # exponential again: mean 1 above what was already borne
     assert abs((toughness - env.recall(rows, "exposure")).mean() - 1) < 0.1

@@ -15,8 +15,8 @@ from PIL import Image
 from hipg_bench import make, task_spec
 from hipg_bench.errors import HipgError, SpecError, UnknownNameError
 from hipg_bench.evaluation.bench import (
+    adapters,
     child,
-    faces,
     films,
     plan,
     plot,
@@ -214,13 +214,13 @@ def test_start_is_timed_beyond_that_of_python():
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_every_face_is_measured_or_says_why_not(num_envs):
-    rows = {row.face: row for row in faces.overheads(SPEC, num_envs, 1, 0.0)}
+    rows = {row.adapter: row for row in adapters.overheads(SPEC, num_envs, 1, 0.0)}
     needs = {"gymnasium vector": "gymnasium", "stable-baselines3": "stable_baselines3", "torchrl": "torchrl"}
     if num_envs == 1:
         needs |= {"pettingzoo": "pettingzoo", "rllib": "ray", "gymnasium": "gymnasium", "dm_env": "dm_env"}
     assert rows.keys() == needs.keys()
-    for face, library in needs.items():
-        row = rows[face]
+    for adapter, library in needs.items():
+        row = rows[adapter]
         if importlib.util.find_spec(library) is None:
             assert library in row.left_out
             assert row.overhead is None
@@ -247,13 +247,13 @@ def test_growth_is_relative_to_the_smallest():
 
 def test_a_request_fills_in_what_was_left_open():
     cores = len(os.sched_getaffinity(0))
-    quick, full = (plan.request([SPEC], full=whole) for whole in (False, True))
+    quick, full = (plan.make_plan([SPEC], full=whole) for whole in (False, True))
     assert (quick.num_envs, quick.threads) == ((1, 64, 1024), (cores,))
     assert full.num_envs == (1, 64, 1024, 4096)
     assert (full.threads[0], full.threads[-1]) == (1, cores)
-    assert plan.request([SPEC], num_envs=[8, 2], threads=[0, 1], seconds=0.5).threads == full.threads[:1] + (
-        (cores,) if cores > 1 else ()
-    )
+    assert plan.make_plan([SPEC], num_envs=[8, 2], threads=[0, 1], seconds=0.5).threads == full.threads[
+        :1
+    ] + ((cores,) if cores > 1 else ())
 
 
 def test_the_document_holds_rows_machine_versions_and_settings(tmp_path):

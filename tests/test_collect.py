@@ -13,7 +13,7 @@ from hipg_bench.cli import app
 from hipg_bench.comparison import artefacts
 from hipg_bench.comparison.cards import readme
 from hipg_bench.errors import BundleError
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.learning import audit, sweep
 from hipg_bench.learning.run import train
 from hipg_bench.policies.bundle import load_agent
@@ -33,7 +33,7 @@ label = "masked"
 settings = { num_envs = 4, rollout = 5, steps = 20, actor_hidden = [8], critic_hidden = [8] }
 """
 TASK = "coop_nav-3"
-FEW = Plan(episodes=8, threads=1)
+FEW = EvaluationJob(episodes=8, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def agents(trained, tmp_path_factory):
     folder = tmp_path_factory.mktemp("agents")
     states = {
         (one.bundle, one.run.settings.seed): one.state
-        for one in artefacts.collect(load(trained), folder, plan=FEW)
+        for one in artefacts.collect(load(trained), folder, job=FEW)
     }
     assert states == {
         ("mappo_minhealth", 0): "new",
@@ -117,7 +117,7 @@ def test_nothing_is_overwritten_unasked(trained, agents: Path, tmp_path: Path) -
     runs = load(trained)[:2]
 
     def states(**options):
-        return [one.state for one in artefacts.collect(runs, tmp_path / "agents", plan=FEW, **options)]
+        return [one.state for one in artefacts.collect(runs, tmp_path / "agents", job=FEW, **options)]
 
     assert states() == ["kept", "there"]
     assert weights.read_bytes() == other
@@ -138,10 +138,10 @@ def test_a_collection_cut_short_is_no_bundle(trained, tmp_path: Path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(artefacts, "_copy", lambda source, target: 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            list(artefacts.collect(runs, tmp_path, plan=FEW))
+            list(artefacts.collect(runs, tmp_path, job=FEW))
     assert load_agent(tmp_path / "mappo_minhealth").tasks == ()
     assert artefacts._copy is copy
-    assert [one.state for one in artefacts.collect(runs, tmp_path, plan=FEW)] == ["new"]
+    assert [one.state for one in artefacts.collect(runs, tmp_path, job=FEW)] == ["new"]
     assert load_agent(tmp_path / "mappo_minhealth").tasks == (TASK,)
 
 
@@ -184,12 +184,12 @@ def test_a_bundle_holds_what_its_run_began_with(trained, agents: Path, tmp_path:
     (tmp_path / "sweep.toml").write_text("[[run]]" + text.replace("[0, 1, 2]", "[1]"))
     (run,) = sweep.load(tmp_path / "sweep.toml", tmp_path / "runs")
     train(run.settings, run.out, command=run.command)
-    list(artefacts.collect([run], tmp_path / "agents", plan=FEW))
+    list(artefacts.collect([run], tmp_path / "agents", job=FEW))
     place = tmp_path / "agents" / "mappo_minhealth" / TASK
     assert (place / "seed1.initial.safetensors").read_bytes() == begun.read_bytes()
     assert load_agent(place.parent).train_seeds(TASK) == (1,)
     assert f'initial_policy="{TASK}/seedK.initial.safetensors"' in (place.parent / "README.md").read_text()
     begun.write_bytes((place / "seed1.safetensors").read_bytes())
     with pytest.raises(BundleError, match="gone or has changed"):
-        list(artefacts.collect([run], tmp_path / "others", plan=FEW))
+        list(artefacts.collect([run], tmp_path / "others", job=FEW))
     assert not (tmp_path / "others" / "mappo_minhealth" / TASK / "seed1.safetensors").exists()

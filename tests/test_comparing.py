@@ -10,7 +10,7 @@ from hipg_bench import task_spec
 from hipg_bench.cli import app
 from hipg_bench.errors import HipgError
 from hipg_bench.evaluation import comparing, runner
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.export import marl_eval
 from hipg_bench.policies.bundle import load_agent
 
@@ -22,8 +22,8 @@ def folders(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
     suite = runner.Suite("custom", tuple(task_spec(task) for task in TASKS))
     for name, split in (("random", "standard"), ("zero", "standard"), ("zero", "forced_death")):
-        plan = Plan(episodes=3, threads=1, split=split)
-        runner.evaluate(load_agent(name), suite, out / f"{name}-{split}", plan)
+        job = EvaluationJob(episodes=3, threads=1, split=split)
+        runner.evaluate(load_agent(name), suite, out / f"{name}-{split}", job)
     return out
 
 
@@ -100,7 +100,7 @@ def test_the_comparison_is_printed(folders):
 
 def evaluated(agent, tasks, out, episodes=3):
     suite = runner.Suite("custom", tuple(task_spec(task) for task in tasks))
-    return runner.evaluate(load_agent(agent), suite, out, Plan(episodes=episodes, threads=1))
+    return runner.evaluate(load_agent(agent), suite, out, EvaluationJob(episodes=episodes, threads=1))
 
 
 def test_only_tasks_in_common_are_ranked(folders, tmp_path):

@@ -274,11 +274,11 @@ def test_curves_come_from_trials_and_else_from_training(agents: Path) -> None:
         ("local", "hazard_nav-4"),
     }
     (old,) = [one for one in found if one.algorithm == "local"]
-    assert not old.tried
+    assert not old.evaluated
     assert old.seed == 7
     np.testing.assert_allclose(old.score, 0.5)
     assert old.final == pytest.approx(0.5), "without a measured score, the curve's end"
-    assert all(one.tried for one in found if one.algorithm != "local")
+    assert all(one.evaluated for one in found if one.algorithm != "local")
     # returns of a training that paid otherwise than the task are no scores
     record = agents / "mappo_local" / "hazard_nav-4" / "seed7.json"
     record.write_text(json.dumps({"settings": {"weights": {"alive": 0.1}}}))
@@ -290,7 +290,7 @@ def test_runs_of_a_task_are_compared_by_one_measurement(agents: Path) -> None:
     rows = [{"steps": 1000 * k, "return": worth("paper_comm-10", 0.25)} for k in range(1, 21)]
     write(agents, "central", "paper_comm-10", 9, rows, final=0.75)
     found = traces(agents)
-    assert not any(one.tried for one in found)
+    assert not any(one.evaluated for one in found)
     (added,) = [one for one in found if one.seed == 9]
     np.testing.assert_allclose(added.score, 0.25)
     assert added.final == pytest.approx(0.75)

@@ -4,7 +4,7 @@ import pytest
 from foreign import TASK, WORKING, A, acting, policy
 
 from hipg_bench.evaluation.decentralised import verify
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 
 pytestmark = pytest.mark.skipif(not WORKING, reason="no sandbox works on this machine")
 SHORT = TASK.override(horizon=12)
@@ -42,7 +42,9 @@ SHARING = {
 
 @pytest.mark.parametrize("name", HONEST)
 def test_an_agent_that_needs_nobody_else_is_decentralised(tmp_path, name):
-    verdict = verify(SHORT, policy(tmp_path, acting(HONEST[name]), spec=SHORT), Plan(threads=1), WORLDS)
+    verdict = verify(
+        SHORT, policy(tmp_path, acting(HONEST[name]), spec=SHORT), EvaluationJob(threads=1), WORLDS
+    )
     assert verdict.decentralised, str(verdict)
     assert 240 < verdict.compared <= 8 * 4 * 12  # eight worlds, four agents, twelve steps, less what died
     assert str(verdict).startswith("decentralised")
@@ -50,7 +52,9 @@ def test_an_agent_that_needs_nobody_else_is_decentralised(tmp_path, name):
 
 @pytest.mark.parametrize("name", SHARING)
 def test_an_agent_that_shares_is_found_out(tmp_path, name):
-    verdict = verify(SHORT, policy(tmp_path, acting(SHARING[name]), spec=SHORT), Plan(threads=1), WORLDS)
+    verdict = verify(
+        SHORT, policy(tmp_path, acting(SHARING[name]), spec=SHORT), EvaluationJob(threads=1), WORLDS
+    )
     assert not verdict.decentralised
     assert str(verdict).startswith(f"centralised: {len(verdict.differences)} agents")
     if name == "talks from the sixth step on":
@@ -59,6 +63,6 @@ def test_an_agent_that_shares_is_found_out(tmp_path, name):
 
 def test_what_cannot_be_compared_is_not_called_decentralised(tmp_path):
     body = "raise RuntimeError('never together')"
-    verdict = verify(SHORT, policy(tmp_path, acting(body), spec=SHORT), Plan(threads=1), WORLDS)
+    verdict = verify(SHORT, policy(tmp_path, acting(body), spec=SHORT), EvaluationJob(threads=1), WORLDS)
     assert (verdict.decentralised, verdict.compared) == (False, 0)
     assert "nothing could be compared" in str(verdict)

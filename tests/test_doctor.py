@@ -1,4 +1,4 @@
-"""The doctor finds what is wrong, and names the line that mends it."""
+"""The doctor finds what is wrong, and names the line that fixes it."""
 
 import importlib.metadata
 import json
@@ -39,17 +39,17 @@ def test_a_variable_that_stops_mujoco_is_named_and_the_exit_code_is_1():
     assert done.returncode == 1
     assert "unset MUJOCO_GL" in done.stdout
     assert "Traceback" not in done.stderr
-    assert "pip install" not in done.stdout.partition("To mend it")[2]
+    assert "pip install" not in done.stdout.partition("To fix it")[2]
 
 
 def test_a_package_that_is_missing_or_of_a_wrong_version_gets_its_line():
     missing = doctor._package(Requirement("no-such-package-here>=2"))
     assert (missing.level, missing.text) == ("broken", "missing")
-    assert missing.mend.endswith("-m pip install 'no-such-package-here>=2'")
+    assert missing.fix.endswith("-m pip install 'no-such-package-here>=2'")
     old = doctor._package(Requirement("numpy<1"))
     assert old.level == "broken"
     assert importlib.metadata.version("numpy") in old.text
-    assert old.mend.endswith("'numpy<1'")
+    assert old.fix.endswith("'numpy<1'")
     assert doctor._package(Requirement("numpy>=2")).level == "ok"
 
 
@@ -58,7 +58,7 @@ def test_without_opengl_scores_still_work(monkeypatch):
     monkeypatch.setattr(gl, "BACKENDS", ("nonsense",))
     findings = list(doctor._graphics())
     assert [finding.level for finding in findings] == ["warning", "warning"]
-    assert all(finding.mend == gl.MEND for finding in findings)
+    assert all(finding.fix == gl.INSTALL_COMMAND for finding in findings)
     assert doctor.healthy(findings)
 
 

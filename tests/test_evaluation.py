@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hipg_bench import make, task_spec
 from hipg_bench.errors import BundleError, HipgError, ResumeError
 from hipg_bench.evaluation import calibration, films, report, runner
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.results import aggregate, summarise
 from hipg_bench.paths import PARTIAL, data_folder
 from hipg_bench.policies.bundle import load_agent
@@ -32,7 +32,7 @@ def anchored(spec, low=-40.0, high=-10.0):
 
 @given(st.integers(0, 300), st.integers(1, 100), st.sets(st.integers(0, 300)))
 def test_batches_cover_what_is_left_once_and_in_order(episodes, num_envs, done):
-    batches = list(Plan(seed=7, episodes=episodes, num_envs=num_envs).batches(done))
+    batches = list(EvaluationJob(seed=7, episodes=episodes, num_envs=num_envs).batches(done))
     assert [world for batch in batches for world in batch] == [k for k in range(episodes) if k not in done]
     for batch in batches:
         assert 1 <= len(batch) <= num_envs
@@ -42,7 +42,7 @@ def test_batches_cover_what_is_left_once_and_in_order(episodes, num_envs, done):
 def test_rows_are_what_a_plain_loop_over_single_worlds_sees():
     """Worlds of two evaluation seeds, each played alone, deaths read off the health step by step."""
     spec, policy = task_spec(TASK), load_agent("scripted_blind").policy(task_spec(TASK))
-    rows = Plan(seed=3, episodes=70, threads=1).play_all(spec, policy)
+    rows = EvaluationJob(seed=3, episodes=70, threads=1).play_all(spec, policy)
     assert [row["world"] for row in rows] == list(range(70))
     assert sum(row["deaths"] for row in rows) > 20
     for world in (0, 1, 2, 63, 64, 69):
@@ -72,8 +72,8 @@ def test_rows_do_not_depend_on_batch_and_threads(num_envs, threads):
     spec = task_spec(TASK).override(horizon=15)
     for name in ("random", "scripted_blind"):
         policy = load_agent(name).policy(spec)
-        expected = Plan(episodes=66, num_envs=64, threads=1).play_all(spec, policy)
-        rows = Plan(episodes=66, num_envs=num_envs, threads=threads).play_all(spec, policy)
+        expected = EvaluationJob(episodes=66, num_envs=64, threads=1).play_all(spec, policy)
+        rows = EvaluationJob(episodes=66, num_envs=num_envs, threads=threads).play_all(spec, policy)
         assert sum(row["deaths"] for row in rows) > 0
         assert json.dumps(rows) == json.dumps(expected)
 
@@ -81,10 +81,10 @@ def test_rows_do_not_depend_on_batch_and_threads(num_envs, threads):
 def test_early_ends_count_first_episodes_only():
     """Dropped planks end episodes at different times; no world's second episode gets in."""
     spec = task_spec("multiwalker-3")
-    rows = Plan(episodes=12, num_envs=12, threads=1).play_all(spec, Random(6))
+    rows = EvaluationJob(episodes=12, num_envs=12, threads=1).play_all(spec, Random(6))
     assert len({row["length"] for row in rows}) > 3
     assert [row["episode_id"] for row in rows] == list(range(12))
-    alone = Plan(episodes=12, num_envs=1, threads=1).play_all(spec, Random(6))
+    alone = EvaluationJob(episodes=12, num_envs=1, threads=1).play_all(spec, Random(6))
     assert json.dumps(rows) == json.dumps(alone)
 
 
@@ -97,7 +97,7 @@ class Monstrous(Constant):
 
 def test_broken_physics_is_scored_at_the_floor():
     spec = anchored(task_spec("paper_nav-4"))
-    rows = Plan(episodes=3, threads=1).play_all(spec, Monstrous(2))
+    rows = EvaluationJob(episodes=3, threads=1).play_all(spec, Monstrous(2))
     assert [row["end_reason"] for row in rows] == ["physics"] * 3
     assert [row["return"] for row in rows] == pytest.approx([spec.floor] * 3)
     summary = summarise(spec, [row | {"train_seed": 0} for row in rows])
@@ -107,14 +107,14 @@ def test_broken_physics_is_scored_at_the_floor():
 
 def test_an_episode_played_again_alone_is_the_same():
     spec, policy = task_spec(TASK), load_agent("scripted_blind").policy(task_spec(TASK))
-    plan = Plan(episodes=66, threads=1)
-    row = plan.play_all(spec, policy)[65]
-    states = plan.record(spec, policy, row)
+    job = EvaluationJob(episodes=66, threads=1)
+    row = job.play_all(spec, policy)[65]
+    states = job.record(spec, policy, row)
     assert len(states) == row["length"] + 1
     env = make(TASK)
     np.testing.assert_array_equal(env.recall(states, "elapsed")[:, 0], np.arange(51))
     with pytest.raises(HipgError, match="played again"):
-        plan.record(spec, policy, row | {"reached": row["reached"] + 1e-9})
+        job.record(spec, policy, row | {"reached": row["reached"] + 1e-9})
 
 
 class PlugError(Exception):
@@ -139,18 +139,18 @@ def suite(*tasks):
 
 
 def test_interrupted_and_resumed_gives_the_same_bytes(tmp_path):
-    agent, tasks, plan = (
+    agent, tasks, job = (
         load_agent("scripted_blind"),
         suite(TASK, "coop_nav-3"),
-        Plan(episodes=80, num_envs=9, threads=1),
+        EvaluationJob(episodes=80, num_envs=9, threads=1),
     )
-    runner.evaluate(agent, tasks, tmp_path / "whole", plan)
+    runner.evaluate(agent, tasks, tmp_path / "whole", job)
     for stop in (30, 75, 100):
         with pytest.raises(PlugError):
-            runner.evaluate(agent, tasks, tmp_path / "parts", plan, progress=stop_after(stop))
+            runner.evaluate(agent, tasks, tmp_path / "parts", job, progress=stop_after(stop))
         assert not list((tmp_path / "parts").rglob(f"{PARTIAL}*"))
     # resumed with another batch size, too
-    runner.evaluate(agent, tasks, tmp_path / "parts", dataclasses.replace(plan, num_envs=64))
+    runner.evaluate(agent, tasks, tmp_path / "parts", dataclasses.replace(job, num_envs=64))
     for task in (TASK, "coop_nav-3"):
         name = f"episodes/{task}.jsonl"
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
@@ -160,32 +160,34 @@ def test_interrupted_and_resumed_gives_the_same_bytes(tmp_path):
 
 def test_a_longer_evaluation_extends_a_shorter_one(tmp_path):
     agent = load_agent("zero")
-    runner.evaluate(agent, suite(TASK), tmp_path / "a", Plan(episodes=5, threads=1))
-    runner.evaluate(agent, suite(TASK), tmp_path / "a", Plan(episodes=9, threads=1))
-    runner.evaluate(agent, suite(TASK), tmp_path / "b", Plan(episodes=9, threads=1))
+    runner.evaluate(agent, suite(TASK), tmp_path / "a", EvaluationJob(episodes=5, threads=1))
+    runner.evaluate(agent, suite(TASK), tmp_path / "a", EvaluationJob(episodes=9, threads=1))
+    runner.evaluate(agent, suite(TASK), tmp_path / "b", EvaluationJob(episodes=9, threads=1))
     name = f"episodes/{TASK}.jsonl"
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_a_folder_of_another_evaluation_is_refused(tmp_path):
-    plan, zero = Plan(episodes=4, threads=1), load_agent("zero")
-    runner.evaluate(zero, suite(TASK), tmp_path, plan)
+    job, zero = EvaluationJob(episodes=4, threads=1), load_agent("zero")
+    runner.evaluate(zero, suite(TASK), tmp_path, job)
     rows = (tmp_path / f"episodes/{TASK}.jsonl").read_bytes()
     with pytest.raises(ResumeError, match="agent is 'zero' there and 'random' here"):
-        runner.evaluate(load_agent("random"), suite(TASK), tmp_path, plan)
+        runner.evaluate(load_agent("random"), suite(TASK), tmp_path, job)
     with pytest.raises(ResumeError, match="seed is 1000 there and 1 here"):
-        runner.evaluate(zero, suite(TASK), tmp_path, dataclasses.replace(plan, seed=1))
+        runner.evaluate(zero, suite(TASK), tmp_path, dataclasses.replace(job, seed=1))
     with pytest.raises(ResumeError, match="world is 3 there and 'below 3' here"):
-        runner.evaluate(zero, suite(TASK), tmp_path, dataclasses.replace(plan, episodes=3))
+        runner.evaluate(zero, suite(TASK), tmp_path, dataclasses.replace(job, episodes=3))
     harder = runner.Suite("custom", (task_spec(TASK).override(hazard_peak=0.9),))
     with pytest.raises(ResumeError, match="fingerprint"):
-        runner.evaluate(zero, harder, tmp_path, plan)
+        runner.evaluate(zero, harder, tmp_path, job)
     assert (tmp_path / f"episodes/{TASK}.jsonl").read_bytes() == rows
 
 
 def test_results_are_computed_from_the_rows(tmp_path):
     tasks = runner.Suite("custom", (anchored(task_spec(TASK)), anchored(task_spec("multiwalker-3"))))
-    results = runner.evaluate(load_agent("scripted_blind"), tasks, tmp_path, Plan(episodes=70, threads=1))
+    results = runner.evaluate(
+        load_agent("scripted_blind"), tasks, tmp_path, EvaluationJob(episodes=70, threads=1)
+    )
     assert json.loads((tmp_path / "results.json").read_text()) == json.loads(json.dumps(results))
     rows = [json.loads(line) for line in (tmp_path / f"episodes/{TASK}.jsonl").read_text().splitlines()]
     (task,) = results["tasks"]
@@ -220,29 +222,31 @@ def test_tasks_without_anchors_are_left_out_of_the_aggregate():
 
 def test_an_agent_that_plays_nothing_is_an_error(tmp_path):
     with pytest.raises(BundleError, match="plays none of these tasks"):
-        runner.evaluate(load_agent("scripted"), suite("multiwalker-3"), tmp_path / "out", Plan(episodes=1))
+        runner.evaluate(
+            load_agent("scripted"), suite("multiwalker-3"), tmp_path / "out", EvaluationJob(episodes=1)
+        )
     assert not (tmp_path / "out").exists()
 
 
 def test_films_are_of_the_median_then_from_worst_to_best(tmp_path):
-    spec, agent, plan = task_spec(TASK), load_agent("random"), Plan(episodes=21, threads=1)
-    rows = [row | {"train_seed": 0} for row in plan.play_all(spec, agent.policy(spec))]
-    jobs = films.choose(agent, spec, rows, plan, 3, tmp_path)
+    spec, agent, job = task_spec(TASK), load_agent("random"), EvaluationJob(episodes=21, threads=1)
+    rows = [row | {"train_seed": 0} for row in job.play_all(spec, agent.policy(spec))]
+    chosen = films.choose(agent, spec, rows, job, 3, tmp_path)
     returns = np.sort([row["return"] for row in rows])
-    assert [job.file for job in jobs] == [f"videos/{TASK}{end}.mp4" for end in ("", "-q000", "-q100")]
+    assert [film.file for film in chosen] == [f"videos/{TASK}{end}.mp4" for end in ("", "-q000", "-q100")]
     env = make(TASK)
-    filmed = [env.recall(np.load(job.saved)["rows"][-1:], "return")[0, 0] for job in jobs]
+    filmed = [env.recall(np.load(film.saved)["rows"][-1:], "return")[0, 0] for film in chosen]
     assert filmed == [returns[10], returns[0], returns[-1]]
     # a longer evaluation has another median episode: its film replaces the old one, and only that
-    for job in jobs:
-        job.video.parent.mkdir(exist_ok=True)
-        job.video.write_bytes(b"film")
+    for film in chosen:
+        film.video.parent.mkdir(exist_ok=True)
+        film.video.write_bytes(b"film")
     extra = [{**rows[0], "world": 100 + k, "return": returns[-1], "train_seed": 1} for k in range(2)]
-    films.choose(agent, spec, rows + extra, plan, 3, tmp_path)
-    assert [job.video.exists() for job in jobs] == [True, True, True]
+    films.choose(agent, spec, rows + extra, job, 3, tmp_path)
+    assert [film.video.exists() for film in chosen] == [True, True, True]
     fewer = [row for row in rows if row["return"] > returns[4]]
-    films.choose(agent, spec, fewer, plan, 3, tmp_path)
-    assert [job.video.exists() for job in jobs] == [False, False, True]
+    films.choose(agent, spec, fewer, job, 3, tmp_path)
+    assert [film.video.exists() for film in chosen] == [False, False, True]
 
 
 @pytest.mark.skipif(gl.working_backend() is None, reason="no OpenGL here")
@@ -250,7 +254,7 @@ def test_an_evaluation_has_a_film_of_the_median_episode(tmp_path):
     short = runner.Suite("custom", (task_spec(TASK).override(horizon=2),))
     stages = []
     results = runner.evaluate(
-        load_agent("random"), short, tmp_path, Plan(episodes=3, threads=1), films_per_task=1,
+        load_agent("random"), short, tmp_path, EvaluationJob(episodes=3, threads=1), films_per_task=1,
         progress=lambda stage, done: stages.append((stage, done)),
     )  # fmt: skip
     assert results["film_trouble"] == []
@@ -286,7 +290,9 @@ def test_the_report_opens_offline_and_trusts_no_name(tmp_path):
     tasks = runner.Suite(
         "custom", (anchored(task_spec(TASK)), task_spec("coop_nav-3"), task_spec("multiwalker-3"))
     )
-    results = runner.evaluate(load_agent(folder), tasks, tmp_path / "out", Plan(episodes=20, threads=1))
+    results = runner.evaluate(
+        load_agent(folder), tasks, tmp_path / "out", EvaluationJob(episodes=20, threads=1)
+    )
     results["films"] = [{"task": TASK, "file": f"videos/{TASK}.mp4", "title": "the median"}]
     specs = {spec.task: spec for spec in tasks.specs[:2]}
     rows = {
@@ -310,19 +316,19 @@ def test_the_report_opens_offline_and_trusts_no_name(tmp_path):
 def test_calibration_measures_what_the_rows_say():
     spec = task_spec(TASK).override(horizon=20)
     measured = calibration.calibrate(spec, 64, threads=1, progress=lambda name, done: None)
-    plan = Plan(10_000, 64, threads=1)
-    random = [row["return"] for row in plan.play_all(spec, Random(3))]
-    expert = [row["return"] for row in plan.play_all(spec, load_agent("scripted").policy(spec))]
+    job = EvaluationJob(10_000, 64, threads=1)
+    random = [row["return"] for row in job.play_all(spec, Random(3))]
+    expert = [row["return"] for row in job.play_all(spec, load_agent("scripted").policy(spec))]
     anchors, facts = measured.spec.anchors, measured.spec.calibration
     assert anchors.random.mean == pytest.approx(np.mean(random), abs=1e-3)
     assert anchors.reference.mean == pytest.approx(np.mean(expert), abs=1e-3)
-    blind = np.mean([row["return"] for row in plan.play_all(spec, load_agent("scripted_blind").policy(spec))])
+    blind = np.mean([row["return"] for row in job.play_all(spec, load_agent("scripted_blind").policy(spec))])
     safe_spec = spec.override(hazard_peak=0.0)
-    safe = plan.play_all(safe_spec, load_agent("scripted_blind").policy(safe_spec))
+    safe = job.play_all(safe_spec, load_agent("scripted_blind").policy(safe_spec))
     assert sum(row["deaths"] for row in safe) == 0
     gap = np.mean(expert) - np.mean(random)
     leverage = (np.mean([row["return"] for row in safe]) - blind) / gap
-    assert facts["hazard_leverage"] == pytest.approx(leverage, abs=1e-3)
+    assert facts["hazard_sensitivity"] == pytest.approx(leverage, abs=1e-3)
     assert 0 < facts["random_deaths"] < 1
     assert all(facts[f"score_{probe}"] < 0.5 for probe in ("zero", "constant", "time_only"))
 
@@ -341,12 +347,12 @@ def test_writing_a_calibration_keeps_the_rest_of_the_file(tmp_path):
     original = (data_folder("tasks") / f"{TASK}.toml").read_text()
     bare = original.split("[anchors]")[0].rstrip() + "\n"
     path.write_text(bare)
-    spec = anchored(load(path)).model_copy(update={"calibration": {"hazard_leverage": 0.3}})
+    spec = anchored(load(path)).model_copy(update={"calibration": {"hazard_sensitivity": 0.3}})
     calibration.write(spec, path)
     first = path.read_text()
     assert first.startswith(bare)
     assert load(path).anchors == spec.anchors
-    assert load(path).calibration == {"hazard_leverage": 0.3}
+    assert load(path).calibration == {"hazard_sensitivity": 0.3}
     assert load(path).fingerprint == spec.fingerprint
     calibration.write(spec, path)
     assert path.read_text() == first
@@ -371,7 +377,8 @@ def test_scores_are_told_and_written_before_films_and_survive_an_interruption(tm
     monkeypatch.setattr("hipg_bench.rendering.film.record", film)
     with pytest.raises(KeyboardInterrupt):
         runner.evaluate(
-            load_agent("zero"), runner.Suite("custom", (spec,)), tmp_path, Plan(episodes=2, threads=1),
+            load_agent("zero"), runner.Suite("custom", (spec,)), tmp_path,
+            EvaluationJob(episodes=2, threads=1),
             films_per_task=1,
             played_task=lambda task: told.append(("task", task["task"])),
             scored=lambda results: told.append(("scored", results["aggregate"]["tasks"])),

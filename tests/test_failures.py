@@ -8,7 +8,7 @@ import pytest
 from hipg_bench import make, task_spec
 from hipg_bench.errors import AgentFailure
 from hipg_bench.evaluation import runner
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.failures import failures_of_a_dnf
 from hipg_bench.evaluation.results import summarise
 from hipg_bench.policies.bundle import Agent, load_agent
@@ -72,9 +72,9 @@ def not_numbers(action, bad):
     ],
 )
 def test_only_the_failed_episodes_change_and_count_less(fault, status):
-    plan = Plan(episodes=21, threads=1)
-    honest = plan.play_all(SPEC, Random(3))
-    rows = plan.play_all(SPEC, Faulty(fault, {0}))
+    job = EvaluationJob(episodes=21, threads=1)
+    honest = job.play_all(SPEC, Random(3))
+    rows = job.play_all(SPEC, Faulty(fault, {0}))
     assert [row["status"] for row in rows] == [status] + 20 * ["ok"]
     for row, good in zip(rows[1:], honest[1:], strict=True):
         assert json.dumps(row) == json.dumps(good)
@@ -102,15 +102,15 @@ def test_a_failure_never_raises_what_was_reached():
             )
         }
     )
-    (row,) = Plan(episodes=1, threads=1).play_all(generous, Faulty(crash, {0}))
+    (row,) = EvaluationJob(episodes=1, threads=1).play_all(generous, Faulty(crash, {0}))
     assert row["return"] == row["reached"] < 1e3
 
 
 @pytest.mark.parametrize("num_envs", [1, 7])
 def test_failed_rows_do_not_depend_on_the_batch(num_envs):
     bad = {3, 9}
-    expected = Plan(episodes=40, num_envs=64, threads=1).play_all(SPEC, Faulty(crash, bad))
-    rows = Plan(episodes=40, num_envs=num_envs, threads=1).play_all(SPEC, Faulty(crash, bad))
+    expected = EvaluationJob(episodes=40, num_envs=64, threads=1).play_all(SPEC, Faulty(crash, bad))
+    rows = EvaluationJob(episodes=40, num_envs=num_envs, threads=1).play_all(SPEC, Faulty(crash, bad))
     assert json.dumps(rows) == json.dumps(expected)
     # 5 % of 40 are 2, so the second failure ends it
     assert [row["world"] for row in rows if row["status"] == "crash"] == [3, 9]
@@ -119,10 +119,10 @@ def test_failed_rows_do_not_depend_on_the_batch(num_envs):
 
 def test_five_percent_of_failures_are_a_dnf_at_the_floor():
     assert [failures_of_a_dnf(n) for n in (320, 64, 21, 20, 1)] == [16, 4, 2, 1, 1]
-    plan = Plan(episodes=24, threads=1)
+    job = EvaluationJob(episodes=24, threads=1)
     for bad, dnf in (({1}, False), ({1, 4}, True)):
         policy = Faulty(crash, bad)
-        rows = [row | {"train_seed": 0} for row in plan.play_all(SPEC, policy)]
+        rows = [row | {"train_seed": 0} for row in job.play_all(SPEC, policy)]
         task = summarise(SPEC, rows)
         assert task["dnf"] is dnf
         assert task["episodes"] == 24
@@ -137,9 +137,9 @@ def test_five_percent_of_failures_are_a_dnf_at_the_floor():
 
 
 def test_one_bad_training_does_not_hide_behind_a_good_one():
-    plan = Plan(episodes=20, threads=1)
-    good = [row | {"train_seed": 0} for row in plan.play_all(SPEC, Random(3))]
-    bad = [row | {"train_seed": 1} for row in plan.play_all(SPEC, Faulty(crash, {5}))]
+    job = EvaluationJob(episodes=20, threads=1)
+    good = [row | {"train_seed": 0} for row in job.play_all(SPEC, Random(3))]
+    bad = [row | {"train_seed": 1} for row in job.play_all(SPEC, Faulty(crash, {5}))]
     task = summarise(SPEC, good + bad)
     mean = np.mean([row["return"] for row in good])
     assert [run["dnf"] for run in task["runs"]] == [False, True]
@@ -157,12 +157,12 @@ def test_a_longer_evaluation_plays_what_a_dnf_left(tmp_path):
     random = load_agent("random")
     agent, suite = FaultyAgent(random.card, random.folder), runner.Suite("custom", (SPEC,))
     name = f"episodes/{SPEC.task}.jsonl"
-    first = runner.evaluate(agent, suite, tmp_path / "a", Plan(episodes=10, threads=1))
+    first = runner.evaluate(agent, suite, tmp_path / "a", EvaluationJob(episodes=10, threads=1))
     assert first["tasks"][0]["failures"] == {"crash": 1, "not_played": 7}
     page = (tmp_path / "a/report.html").read_text()
     assert "DNF" in page
     assert "crash 1, not played 7" in page
-    again = runner.evaluate(agent, suite, tmp_path / "a", Plan(episodes=21, threads=1))
-    runner.evaluate(agent, suite, tmp_path / "b", Plan(episodes=21, threads=1))
+    again = runner.evaluate(agent, suite, tmp_path / "a", EvaluationJob(episodes=21, threads=1))
+    runner.evaluate(agent, suite, tmp_path / "b", EvaluationJob(episodes=21, threads=1))
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert (again["tasks"][0]["failures"], again["tasks"][0]["dnf"]) == ({"crash": 1}, False)

@@ -10,7 +10,7 @@ from foreign import SEEN, TASK, WORKING, A, N, acting, policy, step
 
 from hipg_bench import registry
 from hipg_bench.errors import AgentFailure, HostFailure, SandboxError
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.policies.foreign import agent_seeds
 from hipg_bench.policies.policy import Policy
 from hipg_bench.sandbox import choice
@@ -54,14 +54,14 @@ class _Linear:
 
 def test_episodes_are_the_same_in_the_sandbox_in_a_plain_child_and_in_this_process(tmp_path):
     short = TASK.override(horizon=40)
-    plan = Plan(episodes=3, threads=1)
-    here = plan.play_all(short, _Linear())
+    job = EvaluationJob(episodes=3, threads=1)
+    here = job.play_all(short, _Linear())
     for trust in (False, True):
         agent = policy(tmp_path, LINEAR, spec=short, trust=trust)
         assert isinstance(agent, Policy)
         assert agent.sandbox == ("none" if trust else WORKING[0])
-        assert plan.play_all(short, agent) == here
-    one_by_one = Plan(episodes=3, num_envs=1, threads=1)
+        assert job.play_all(short, agent) == here
+    one_by_one = EvaluationJob(episodes=3, num_envs=1, threads=1)
     assert one_by_one.play_all(short, policy(tmp_path, LINEAR, spec=short)) == here
 
 

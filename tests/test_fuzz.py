@@ -30,7 +30,7 @@ from hipg_bench import task_spec
 from hipg_bench.cli import app
 from hipg_bench.errors import HipgError
 from hipg_bench.evaluation import runner
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.leaderboard.adding import _points
 from hipg_bench.learning import checkpoint, sweep
@@ -59,7 +59,7 @@ def good(tmp_path_factory):
     """One sound file of each kind."""
     place = tmp_path_factory.mktemp("good")
     suite = runner.Suite("custom", (SPEC.override(horizon=5),))
-    runner.evaluate(load_agent("scripted"), suite, place / "e", Plan(episodes=2, threads=1))
+    runner.evaluate(load_agent("scripted"), suite, place / "e", EvaluationJob(episodes=2, threads=1))
     folder = network(place / "newcomer")
     return {
         "rows": (place / "e" / "episodes" / f"{TASK}.jsonl").read_text().splitlines()[0],

@@ -1,6 +1,6 @@
 """Two short episodes of every task, recorded: behaviour changes on purpose or not at all.
 
-`make golden` records them anew. Results are bit for bit the same with the pinned engine and array library on
+`make golden` records them again. Results are bit for bit the same with the pinned engine and array library on
 the machines of `hipg_bench.evaluation.machines`; on others these tests skip and say why.
 """
 

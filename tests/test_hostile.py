@@ -20,7 +20,7 @@ import pytest
 from foreign import TASK, WORKING, descendants, policy
 
 from hipg_bench.evaluation.decentralised import verify
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.runner import Suite, evaluate
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.sandbox import choice
@@ -28,7 +28,7 @@ from hipg_bench.sandbox.budget import Budget
 
 pytestmark = pytest.mark.skipif(not WORKING, reason="no sandbox works on this machine")
 FOLDER = Path(__file__).parent / "hostile"
-PLAN = Plan(episodes=2, threads=1)
+JOB = EvaluationJob(episodes=2, threads=1)
 SHORT = Budget(start_up=30.0, soft=0.25, hard=1.5, bank=0.4, memory=256 << 20)
 SALT = b"a salt of at least thirty-two bytes, for a test"
 
@@ -54,7 +54,7 @@ ANYWHERE += [(name, WORKING[0]) for name in (*STATUS, *SAME_AS_HONEST) if WORKIN
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory):
     """Rows of the honest agent in the same two worlds."""
-    rows = PLAN.play_all(TASK, _agent("honest", tmp_path_factory.mktemp("honest"), {}))
+    rows = JOB.play_all(TASK, _agent("honest", tmp_path_factory.mktemp("honest"), {}))
     assert [row["status"] for row in rows] == ["ok", "ok"]
     assert np.mean([row["score"] for row in rows]) > 0.3  # there is something to lose
     return rows
@@ -108,7 +108,7 @@ def _agent(name, folder, targets, budget=SHORT):
 @pytest.mark.parametrize(("name", "sandbox"), ANYWHERE)
 def test_a_hostile_agent_gains_nothing_and_harms_nobody(scene, honest, monkeypatch, name, sandbox):
     monkeypatch.setattr(choice, "BACKENDS", {sandbox: choice.BACKENDS[sandbox]})
-    rows = PLAN.play_all(TASK, _agent(name, *scene))
+    rows = JOB.play_all(TASK, _agent(name, *scene))
     if name in SAME_AS_HONEST:
         assert rows == honest
         return
@@ -121,25 +121,25 @@ def test_without_a_sandbox_the_salt_would_be_found(scene):
     """The attacker is able: it is the sandbox that stops it."""
     folder, targets = scene
     _agent("salt_finder", folder, targets)
-    rows = PLAN.play_all(TASK, policy(folder, trust=True))
+    rows = JOB.play_all(TASK, policy(folder, trust=True))
     assert [row["status"] for row in rows] == ["crash", "not_played"]
 
 
 def test_an_idle_agent_plays_and_scores_less(scene, honest):
-    rows = PLAN.play_all(TASK, _agent("idle", *scene))
+    rows = JOB.play_all(TASK, _agent("idle", *scene))
     assert [row["status"] for row in rows] == ["ok", "ok"]
     assert all(row["score"] < other["score"] for row, other in zip(rows, honest, strict=True))
 
 
 def test_an_agent_that_shares_is_listed_as_centralised(scene, honest):
     agent = _agent("sharer", *scene)
-    assert [row["status"] for row in PLAN.play_all(TASK, agent)] == ["ok", "ok"]
+    assert [row["status"] for row in JOB.play_all(TASK, agent)] == ["ok", "ok"]
     short = TASK.override(horizon=10)
-    verdict = verify(short, agent, PLAN, [0, 1])
+    verdict = verify(short, agent, JOB, [0, 1])
     assert not verdict.decentralised
     told = {difference.agent for difference in verdict.differences}
     assert told == {1, 2, 3}  # it is the first one that the others hear of
-    assert verify(short, _agent("honest", *scene), PLAN, [0, 1]).decentralised
+    assert verify(short, _agent("honest", *scene), JOB, [0, 1]).decentralised
 
 
 def test_every_folder_is_played():
@@ -159,7 +159,7 @@ def test_a_run_goes_on_after_an_agent_that_crashes(tmp_path, honest):
             f"[tasks]\n{TASK.task} = [0]\n"
         )
         suite = Suite("one", (TASK,))
-        results[name] = evaluate(load_agent(folder), suite, tmp_path / f"out-{name}", PLAN)
+        results[name] = evaluate(load_agent(folder), suite, tmp_path / f"out-{name}", JOB)
     (crashed,), (fine,) = (results[name]["tasks"] for name in ("crash_at_step", "honest"))
     assert crashed["dnf"]
     assert not fine["dnf"]

@@ -16,7 +16,7 @@ from hipg_bench import make, task_spec
 from hipg_bench.errors import BundleError
 from hipg_bench.policies.attention import Group
 from hipg_bench.policies.bundle import load_agent
-from hipg_bench.policies.network import AttentionForm, Form, GRUForm, load_network, save_network
+from hipg_bench.policies.network import AttentionSpec, GRUSpec, NetworkSpec, load_network, save_network
 
 LAYERS = {"layer0.weight": (6, 5), "layer0.bias": (6,), "layer1.weight": (4, 6), "layer1.bias": (4,)}
 
@@ -32,42 +32,42 @@ def tensors(lead=(), **changed):
     }
 
 
-def by_hand(content, form, observation, agent):
+def by_hand(content, spec, observation, agent):
     """One agent's action, layer by layer."""
     own = {name: array.astype(np.float32).astype(np.float64) for name, array in content.items()}
     if own["layer0.bias"].ndim == 2:
         own = {name: array[agent] if name.startswith("layer") else array for name, array in own.items()}
     seen = np.clip((observation - own["observation.mean"]) / own["observation.scale"], -10, 10)
     hidden = own["layer0.weight"] @ seen + own["layer0.bias"]
-    hidden = np.tanh(hidden) if form.activation == "tanh" else np.maximum(hidden, 0)
+    hidden = np.tanh(hidden) if spec.activation == "tanh" else np.maximum(hidden, 0)
     out = own["layer1.weight"] @ hidden + own["layer1.bias"]
-    if form.head == "bins":
-        places = [int(np.argmax(out[start : start + form.bins])) for start in range(0, 4, form.bins)]
-        return form.reach * np.array([np.linspace(-1, 1, form.bins)[place] for place in places])
-    if form.head == "linear":
-        return form.reach * out
-    return form.reach * (np.tanh(out) if form.head == "tanh" else np.clip(out, -1, 1))
+    if spec.head == "bins":
+        places = [int(np.argmax(out[start : start + spec.bins])) for start in range(0, 4, spec.bins)]
+        return spec.reach * np.array([np.linspace(-1, 1, spec.bins)[place] for place in places])
+    if spec.head == "linear":
+        return spec.reach * out
+    return spec.reach * (np.tanh(out) if spec.head == "tanh" else np.clip(out, -1, 1))
 
 
-FORMS = [
-    Form(),
-    Form(head="linear"),
-    Form(activation="relu", head="tanh", reach=5.0),
-    Form(activation="relu", head="bins", bins=2),
-    Form(activation="relu", head="bins", bins=4),
+SPECS = [
+    NetworkSpec(),
+    NetworkSpec(head="linear"),
+    NetworkSpec(activation="relu", head="tanh", reach=5.0),
+    NetworkSpec(activation="relu", head="bins", bins=2),
+    NetworkSpec(activation="relu", head="bins", bins=4),
 ]
 
 
 @pytest.mark.parametrize("lead", [(), (3,)], ids=["shared", "apart"])
-@pytest.mark.parametrize("form", FORMS, ids=str)
-def test_a_policy_file_acts_as_it_declares(tmp_path, form, lead):
+@pytest.mark.parametrize("spec", SPECS, ids=str)
+def test_a_policy_file_acts_as_it_declares(tmp_path, spec, lead):
     content = tensors(lead)
-    save_network(content, tmp_path / "one.safetensors", form)
+    save_network(content, tmp_path / "one.safetensors", spec)
     policy = load_network(tmp_path / "one.safetensors")
     observation = np.random.default_rng(4).normal(0, 3, size=(6, 3, 5)).astype(np.float32)
     assert policy.initial_state(0, np.arange(6), 3) is None
     action, _ = policy.act(observation, None, np.ones((6, 3), bool))
-    expected = np.array([[by_hand(content, form, seen[i], i) for i in range(3)] for seen in observation])
+    expected = np.array([[by_hand(content, spec, seen[i], i) for i in range(3)] for seen in observation])
     assert policy.action_size == expected.shape[-1]
     np.testing.assert_allclose(action, expected, atol=1e-5)
     assert (action * 2**16 == np.round(action * 2**16)).all()
@@ -77,7 +77,7 @@ def test_a_policy_file_acts_as_it_declares(tmp_path, form, lead):
 
 def test_equal_values_take_the_first_bin(tmp_path):
     content = tensors() | {"layer1.weight": np.zeros((4, 6)), "layer1.bias": np.full(4, 0.3)}
-    save_network(content, tmp_path / "one.safetensors", Form(head="bins", bins=4))
+    save_network(content, tmp_path / "one.safetensors", NetworkSpec(head="bins", bins=4))
     policy = load_network(tmp_path / "one.safetensors")
     action, _ = policy.act(np.ones((1, 1, 5), np.float32), None, np.ones((1, 1), bool))
     assert action.tolist() == [[[-1.0]]]
@@ -85,7 +85,7 @@ def test_equal_values_take_the_first_bin(tmp_path):
 
 def test_the_same_network_is_the_same_file(tmp_path):
     for name in ("a", "b"):
-        save_network(tensors(), tmp_path / name, FORMS[1])
+        save_network(tensors(), tmp_path / name, SPECS[1])
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -93,9 +93,9 @@ def test_a_file_of_the_first_format_is_a_shared_tanh_network(tmp_path):
     content = {name: array.astype(np.float32) for name, array in tensors().items()}
     save_file(content, tmp_path / "old.safetensors", {"format": "hipg-mlp-1"})
     policy = load_network(tmp_path / "old.safetensors")
-    assert policy.form == Form()
+    assert policy.spec == NetworkSpec()
     action, _ = policy.act(np.ones((1, 1, 5), np.float32), None, np.ones((1, 1), bool))
-    np.testing.assert_allclose(action[0, 0], by_hand(content, Form(), np.ones(5), 0), atol=1e-5)
+    np.testing.assert_allclose(action[0, 0], by_hand(content, NetworkSpec(), np.ones(5), 0), atol=1e-5)
 
 
 def test_weights_of_three_agents_are_not_a_team_of_four(tmp_path):
@@ -113,8 +113,8 @@ def test_weights_of_three_agents_are_not_a_team_of_four(tmp_path):
             "'hipg-mlp-1', 'hipg-mlp-2', 'hipg-gru-1', 'hipg-attention-1' are allowed, got 'hipg-mlp-3'",
         ),
         ("", {}, "are allowed, got ''"),
-        ("hipg-mlp-2", {}, "its form '' is refused"),
-        ("hipg-mlp-2 []", {}, "its form '[]' is refused"),
+        ("hipg-mlp-2", {}, "its spec '' is refused"),
+        ("hipg-mlp-2 []", {}, "its spec '[]' is refused"),
         ('hipg-mlp-2 {"activation": "gelu"}', {}, "activation = 'gelu' is refused"),
         ('hipg-mlp-2 {"activaton": "relu"}', {}, "no field 'activaton'; did you mean 'activation'?"),
         ('hipg-mlp-2 {"head": "bins"}', {}, "2 or more bins belong to the head 'bins', got 0"),
@@ -181,7 +181,7 @@ def gru_file(tmp_path_factory):
     tensors = normaliser(5) | plain(encoder, "encoder0.") | plain(first, "layer0.") | plain(last, "layer1.")
     tensors |= {f"gru.{name.removesuffix('_l0')}": one for name, one in plain(unit).items()}
     path = tmp_path_factory.mktemp("gru") / "one.safetensors"
-    save_network(tensors, path, GRUForm(activation="relu", head="tanh"))
+    save_network(tensors, path, GRUSpec(activation="relu", head="tanh"))
     return path, tensors, (encoder, unit, first, last)
 
 
@@ -235,9 +235,9 @@ def attention_file(request, tmp_path_factory):
     # own: health 1, velocity 3, position 3; a neighbour: 8; a point: position 3, hazardous 1, gap 1
     sizes = {"own": (7, 16), "neighbor": (8, 16), "point": (5, 16), "layer0": (32, 3)}
     parts = {name: nn.Linear(*size) for name, size in sizes.items()}
-    form = AttentionForm.of(LAYOUT, "neighbor", "point", pool="mean")
+    spec = AttentionSpec.of(LAYOUT, "neighbor", "point", pool="mean")
     if request.param == "attention":
-        form = AttentionForm.of(LAYOUT, "neighbor", "point", heads=4)
+        spec = AttentionSpec.of(LAYOUT, "neighbor", "point", heads=4)
         parts["attention"] = nn.MultiheadAttention(16, 4, batch_first=True)
         nn.init.normal_(parts["attention"].in_proj_bias)
         nn.init.normal_(parts["attention"].out_proj.bias)
@@ -245,7 +245,7 @@ def attention_file(request, tmp_path_factory):
     for name, part in parts.items():
         tensors |= plain(part, f"{name}.")
     path = tmp_path_factory.mktemp("attention") / "one.safetensors"
-    save_network(tensors, path, form)
+    save_network(tensors, path, spec)
     return path, tensors, parts
 
 
@@ -312,7 +312,7 @@ def test_neighbours_are_looked_at_alike(attention_file):
 
 def test_who_sees_nobody_gets_zeros_for_an_answer(tmp_path):
     """With neighbours as the only group and a last layer that passes the answer on, that is the action."""
-    form = AttentionForm.of(LAYOUT, "neighbor", heads=1)
+    spec = AttentionSpec.of(LAYOUT, "neighbor", heads=1)
     torch.manual_seed(0)
     attention = nn.MultiheadAttention(3, 1, batch_first=True)
     nn.init.ones_(attention.out_proj.bias)
@@ -320,7 +320,7 @@ def test_who_sees_nobody_gets_zeros_for_an_answer(tmp_path):
     tensors |= plain(nn.Linear(LAYOUT.size - 24, 3), "own.") | plain(nn.Linear(8, 3), "neighbor.")
     tensors |= plain(attention, "attention.")
     tensors |= {"layer0.weight": np.hstack([np.zeros((3, 3)), np.eye(3)]), "layer0.bias": np.zeros(3)}
-    save_network(tensors, tmp_path / "one.safetensors", form)
+    save_network(tensors, tmp_path / "one.safetensors", spec)
     observation = observations(8, 4)
     nobody = ~LAYOUT.view(observation, "neighbor_seen").any(-1)
     action, _ = load_network(tmp_path / "one.safetensors").act(observation, None, np.ones((8, 4), bool))
@@ -347,15 +347,18 @@ def test_attention_is_for_one_observation_only(attention_file, tmp_path):
     shutil.copy(attention_file[0], path)
     spec = task_spec("hazard_nav-4")
     assert load_agent(tmp_path).policy(spec).observation_size == LAYOUT.size
-    form = load_network(path).form
+    network_spec = load_network(path).spec
     renamed = tuple(
-        ("point_hazard" if name == "point_hazardous" else name, shape) for name, shape in form.observation
+        ("point_hazard" if name == "point_hazardous" else name, shape)
+        for name, shape in network_spec.observation
     )
     blocks = tuple(
-        "point_hazard" if name == "point_hazardous" else name for name in form.groups["point"].blocks
+        "point_hazard" if name == "point_hazardous" else name for name in network_spec.groups["point"].blocks
     )
-    groups = form.groups | {"point": Group(blocks=blocks)}
-    save_network(attention_file[1], path, form.model_copy(update={"observation": renamed, "groups": groups}))
+    groups = network_spec.groups | {"point": Group(blocks=blocks)}
+    save_network(
+        attention_file[1], path, network_spec.model_copy(update={"observation": renamed, "groups": groups})
+    )
     with pytest.raises(
         BundleError, match=r"shows the blocks health \(1,\), .*its network declares .*point_hazard \(4,\)"
     ):
@@ -366,7 +369,7 @@ def test_a_form_says_which_blocks_there_are():
     with pytest.raises(
         BundleError, match=r"no blocks 'neighbour_...' in the observation; did you mean 'neighbor'"
     ):
-        AttentionForm.of(LAYOUT, "neighbour")
+        AttentionSpec.of(LAYOUT, "neighbour")
 
 
 @pytest.mark.parametrize(
@@ -387,13 +390,13 @@ def test_a_form_says_which_blocks_there_are():
 def test_malformed_gru_files_are_refused(gru_file, tmp_path, changed, reason):
     shapes = {name: tensor.shape for name, tensor in gru_file[1].items()} | changed
     content = {name: np.ones(shape, np.float32) for name, shape in shapes.items() if shape is not None}
-    save_network(content, tmp_path / "one.safetensors", GRUForm())
+    save_network(content, tmp_path / "one.safetensors", GRUSpec())
     with pytest.raises(BundleError) as caught:
         load_network(tmp_path / "one.safetensors")
     assert reason in str(caught.value)
 
 
-OBSERVED = AttentionForm.of(LAYOUT, "neighbor").observation
+OBSERVED = AttentionSpec.of(LAYOUT, "neighbor").observation
 BLOCKS = ("neighbor_seen", "neighbor_health")
 
 
@@ -424,7 +427,7 @@ BLOCKS = ("neighbor_seen", "neighbor_health")
     ],
 )
 def test_malformed_attention_files_are_refused(tmp_path, changed, reason):
-    form = json.loads(AttentionForm.of(LAYOUT, "neighbor").model_dump_json()) | changed
+    spec = json.loads(AttentionSpec.of(LAYOUT, "neighbor").model_dump_json()) | changed
     parts = {
         "own": nn.Linear(27, 16),
         "neighbor": nn.Linear(8, 16),
@@ -434,7 +437,7 @@ def test_malformed_attention_files_are_refused(tmp_path, changed, reason):
     for name, part in parts.items():
         content |= plain(part, f"{name}.")
     plain32 = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in content.items()}
-    save_file(plain32, tmp_path / "one.safetensors", {"format": f"hipg-attention-1 {json.dumps(form)}"})
+    save_file(plain32, tmp_path / "one.safetensors", {"format": f"hipg-attention-1 {json.dumps(spec)}"})
     with pytest.raises(BundleError) as caught:
         load_network(tmp_path / "one.safetensors")
     assert reason in str(caught.value)

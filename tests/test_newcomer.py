@@ -13,7 +13,7 @@ import pytest
 from hipg_bench import task_spec
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.graph import check_graph
-from hipg_bench.policies.network import GRUForm, load_network
+from hipg_bench.policies.network import GRUSpec, load_network
 from hipg_bench.submissions.archive import unpack
 
 ROOT = Path(__file__).parents[1]
@@ -107,5 +107,5 @@ def test_what_the_page_exports_can_be_read(tmp_path, monkeypatch):
         for name in ("mlp", "gru", "attention")
     }
     assert {(one.observation_size, one.action_size) for one in networks.values()} == {(51, 3)}
-    assert isinstance(networks["gru"].form, GRUForm)
+    assert isinstance(networks["gru"].spec, GRUSpec)
     check_graph(tmp_path / "onnx_agent.onnx", task_spec("hazard_nav-4"))

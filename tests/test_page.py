@@ -20,9 +20,9 @@ from hipg_bench.errors import BoardError
 from hipg_bench.evaluation import protocol, runner
 from hipg_bench.leaderboard import films
 from hipg_bench.leaderboard.board import Board
-from hipg_bench.leaderboard.playing import Match
+from hipg_bench.leaderboard.entry_view import read_board
+from hipg_bench.leaderboard.playing import BoardEvaluation
 from hipg_bench.leaderboard.salt import new_salt, read_salt
-from hipg_bench.leaderboard.shown import read_board
 from hipg_bench.leaderboard.site import build
 from hipg_bench.leaderboard.source import opened
 from hipg_bench.leaderboard.verify import verify
@@ -30,7 +30,7 @@ from hipg_bench.rendering import gl
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-MATCH = Match((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
+EVALUATION = BoardEvaluation((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
 EVIL = (
     "<script>window.pwned=1</script><img src=x onerror='window.pwned=2'>{{7*7}}{% raw %}"
     "</style><style>body{display:none}</style>\"'><svg onload=window.pwned=3>"
@@ -72,18 +72,20 @@ def board(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(films, "_SIZE", (160, 90))
         patch.setattr(films, "_FPS", 5)
-        add(board, network(place / "newcomer"), MATCH, film_tasks=filmed)
-    add(board, with_seeds(network(place / "steady", "steady"), 5), MATCH)
+        add(board, network(place / "newcomer"), EVALUATION, film_tasks=filmed)
+    add(board, with_seeds(network(place / "steady", "steady"), 5), EVALUATION)
     if (board.folder("newcomer") / "films").exists():
         # the same weights in the same world: the same film
         shutil.copytree(board.folder("newcomer") / "films", board.folder("steady") / "films")
-    add(board, "scripted", MATCH)
-    add(board, "zero", MATCH)
+    add(board, "scripted", EVALUATION)
+    add(board, "zero", EVALUATION)
     package = zipped(hostile(place / "hostile"))
     with opened(package) as source:
-        runner.evaluate(source.agent, MATCH.suite(), place / "claims" / "standard", MATCH.plan("standard"))
+        runner.evaluate(
+            source.agent, EVALUATION.suite(), place / "claims" / "standard", EVALUATION.job("standard")
+        )
     claims = altered(place / "claims", place / "evil", lambda row: row.update(end_reason=EVIL[:100]))
-    add(board, package, Match((TASK,), ("standard",), episodes=6, threads=1), claims=claims)
+    add(board, package, BoardEvaluation((TASK,), ("standard",), episodes=6, threads=1), claims=claims)
     salt = read_salt(board.root, place / "salt")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "differences", list)
@@ -360,10 +362,10 @@ def test_a_film_is_kept_while_its_episodes_are_the_same(board, tmp_path):
     again = Board(tmp_path / "board")
     (again.folder("zero") / "films").mkdir()
     (again.folder("zero") / "films" / f"{TASK}.mp4").write_bytes(b"a film")
-    add(again, "zero", MATCH, replace=True)
+    add(again, "zero", EVALUATION, replace=True)
     assert (again.folder("zero") / "films" / f"{TASK}.mp4").read_bytes() == b"a film"
     # other worlds: it is not theirs
-    add(again, "zero", Match((TASK,), ("standard",), episodes=4, threads=1), replace=True)
+    add(again, "zero", BoardEvaluation((TASK,), ("standard",), episodes=4, threads=1), replace=True)
     assert not (again.folder("zero") / "films").exists()
 
 
@@ -422,7 +424,7 @@ def test_an_odd_learning_curve_breaks_no_page(tmp_path, curve):
     folder = network(tmp_path / "odd", "odd")
     (folder / TASK / "seed0.curve.csv").write_text(curve)
     own = Board(tmp_path / "board")
-    add(own, folder, Match((TASK,), ("standard",), episodes=3, threads=1))
+    add(own, folder, BoardEvaluation((TASK,), ("standard",), episodes=3, threads=1))
     assert len(build(own, tmp_path / "site").entries) == 1
     page = (tmp_path / "site/agents/odd.html").read_text()
     assert not re.search(r'[ "]nan[ ",]', page.lower())

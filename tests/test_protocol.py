@@ -14,7 +14,7 @@ import hipg_bench
 from hipg_bench import task_spec
 from hipg_bench.errors import HipgError, ResumeError
 from hipg_bench.evaluation import machines, protocol, runner, seeds, sources
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.policies.simple import Random, Zero
 
@@ -67,13 +67,15 @@ def test_what_is_loaded_to_play_is_frozen(tmp_path):
     code = (
         "import sys\nfrom pathlib import Path\n"
         "from hipg_bench import task_spec\nfrom hipg_bench.evaluation import runner\n"
-        "from hipg_bench.evaluation.episodes import Plan\nfrom hipg_bench.evaluation import results\n"
+        "from hipg_bench.evaluation.episodes import EvaluationJob\n"
+        "from hipg_bench.evaluation import results\n"
         "from hipg_bench.policies.network import load_network\nfrom hipg_bench.paths import data_folder\n"
         "for task in ('hazard_nav-4', 'multiwalker-3', 'paper_comm-10'):\n"
         "    path = data_folder('agents') / 'mappo_minhealth' / task / 'seed0.safetensors'\n"
         "    for split in ('standard', 'ad_hoc') if task[0] != 'p' else ('standard',):\n"
         "        spec = task_spec(task).override(horizon=3)\n"
-        "        rows = Plan(episodes=1, threads=1, split=split).play_all(spec, load_network(path))\n"
+        "        job = EvaluationJob(episodes=1, threads=1, split=split)\n"
+        "        rows = job.play_all(spec, load_network(path))\n"
         "print(*sorted(str(m.__file__) for n, m in sys.modules.items() if n.startswith('hipg_bench')))"
     )
     done = subprocess.run(
@@ -123,12 +125,12 @@ def test_hidden_seeds_are_an_hmac():
 
 
 def test_public_worlds_are_numbered_and_apart_from_training():
-    plan = Plan()
-    assert [plan.eval_seed("any", world) for world in (0, 63, 64, 319)] == [1000, 1000, 1001, 1004]
+    job = EvaluationJob()
+    assert [job.eval_seed("any", world) for world in (0, 63, 64, 319)] == [1000, 1000, 1001, 1004]
 
 
 def test_a_row_of_a_hidden_world_does_not_tell_its_seed():
-    hidden, public = Plan(episodes=2, threads=1, salt=SALT), Plan(episodes=2, threads=1)
+    hidden, public = EvaluationJob(episodes=2, threads=1, salt=SALT), EvaluationJob(episodes=2, threads=1)
     rows = hidden.play_all(NAV, Random(3))
     secret = str(hidden.eval_seed(NAV.task, 0))
     assert secret not in json.dumps(rows)
@@ -143,36 +145,36 @@ def test_a_row_of_a_hidden_world_does_not_tell_its_seed():
 
 @pytest.mark.parametrize("salt", [None, SALT])
 def test_all_agents_meet_the_same_worlds(salt):
-    plan = Plan(episodes=2, threads=1, salt=salt)
+    job = EvaluationJob(episodes=2, threads=1, salt=salt)
     starts = []
     for policy in (Random(3), Zero(3)):
-        rows = plan.play_all(NAV, policy)
-        starts.append([plan.record(NAV, policy, row)[0] for row in rows])
+        rows = job.play_all(NAV, policy)
+        starts.append([job.record(NAV, policy, row)[0] for row in rows])
     # toughness, which decides who survives what, is part of the row
     np.testing.assert_array_equal(*starts)
 
 
 def test_a_hidden_evaluation_publishes_the_commitment_only(tmp_path):
     suite, agent = runner.Suite("custom", (NAV,)), load_agent("zero")
-    plan = Plan(episodes=3, threads=1, salt=SALT)
-    results = runner.evaluate(agent, suite, tmp_path, plan)
+    job = EvaluationJob(episodes=3, threads=1, salt=SALT)
+    results = runner.evaluate(agent, suite, tmp_path, job)
     assert (results["seed"], results["commitment"]) == (None, seeds.commitment(SALT))
-    secret = str(plan.eval_seed(NAV.task, 0))
+    secret = str(job.eval_seed(NAV.task, 0))
     for path in tmp_path.rglob("*"):
         if path.is_file():
             assert secret not in path.read_text()
             assert SALT.hex() not in path.read_text()
     # resumed with the same salt only
-    runner.evaluate(agent, suite, tmp_path, plan)
+    runner.evaluate(agent, suite, tmp_path, job)
     with pytest.raises(ResumeError, match="commitment"):
-        runner.evaluate(agent, suite, tmp_path, Plan(episodes=3, threads=1, salt=SALT[1:]))
+        runner.evaluate(agent, suite, tmp_path, EvaluationJob(episodes=3, threads=1, salt=SALT[1:]))
     with pytest.raises(ResumeError, match="seed"):
-        runner.evaluate(agent, suite, tmp_path, Plan(episodes=3, threads=1))
+        runner.evaluate(agent, suite, tmp_path, EvaluationJob(episodes=3, threads=1))
 
 
 def test_results_say_which_suite_they_are_of(tmp_path):
     suite = runner.Suite("custom", (NAV,))
-    results = runner.evaluate(load_agent("zero"), suite, tmp_path, Plan(episodes=3, threads=1))
+    results = runner.evaluate(load_agent("zero"), suite, tmp_path, EvaluationJob(episodes=3, threads=1))
     assert results["protocol"] == protocol.identity()
     assert results["protocol"]["suite"] == "hipg-1"
     assert (results["schema"], results["split"], results["kind"]) == (2, "standard", "reference")

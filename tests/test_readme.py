@@ -9,7 +9,7 @@ import pytest
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-FACES = {
+ADAPTERS = {
     "PettingZoo": "pettingzoo",
     "Gymnasium": "gymnasium",
     "dm_control": "dm_control",
@@ -18,11 +18,11 @@ FACES = {
     "RLlib": "ray",
     "BenchMARL": "benchmarl",
 }
-"""How a block on a face begins, and the library it needs."""
+"""How a block on an adapter begins, and the library it needs."""
 
 
-def block_on(face: str) -> str:
-    (code,) = [block for block in BLOCKS if re.match(rf"# {face}\b", block)]
+def block_on(adapter: str) -> str:
+    (code,) = [block for block in BLOCKS if re.match(rf"# {adapter}\b", block)]
     return code
 
 
@@ -35,18 +35,18 @@ def test_the_python_example_runs_and_prints_a_return_and_deaths(capsys) -> None:
     assert 0 < deaths < 8
 
 
-@pytest.mark.parametrize("face", FACES)
-def test_five_lines_are_enough_for_every_face(face: str, tmp_path, monkeypatch) -> None:
-    code = block_on(face)
+@pytest.mark.parametrize("adapter", ADAPTERS)
+def test_five_lines_are_enough_for_every_adapter(adapter: str, tmp_path, monkeypatch) -> None:
+    code = block_on(adapter)
     assert len(re.findall(r"^(?!#|from |import |$)", code.rstrip(), re.MULTILINE)) <= 5, "besides imports"
-    if importlib.util.find_spec(FACES[face]) is None:
-        pytest.skip(f"{FACES[face]} is not installed here")
+    if importlib.util.find_spec(ADAPTERS[adapter]) is None:
+        pytest.skip(f"{ADAPTERS[adapter]} is not installed here")
     monkeypatch.chdir(tmp_path)
     shown: dict[str, object] = {}
     exec(compile(code, README, "exec"), shown)
-    if face == "PettingZoo":
+    if adapter == "PettingZoo":
         assert shown["env"].agents == []
-    if face == "RLlib":
+    if adapter == "RLlib":
         train_once(shown["config"])
 
 

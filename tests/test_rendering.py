@@ -21,8 +21,8 @@ from hipg_bench.errors import RenderError, UnknownNameError
 from hipg_bench.rendering import drones, film, gl, palette
 from hipg_bench.rendering.camera import Camera
 from hipg_bench.rendering.hud import Caption, Hud, Reading
-from hipg_bench.rendering.motion import Footage
-from hipg_bench.rendering.scene import LOOKS, Stage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.scene import LOOKS, Scene
 
 SIZE = (320, 180)
 FPS = 10
@@ -52,7 +52,7 @@ def navigation():
 def test_a_film_has_the_size_the_rate_and_the_frames_that_were_asked_for(navigation, tmp_path, backend):
     probe = gl.probe(backend)
     if not probe.works:
-        pytest.skip(f"{backend} does not work here: {probe.error}; {gl.MEND}")
+        pytest.skip(f"{backend} does not work here: {probe.error}; {gl.INSTALL_COMMAND}")
     _, rows = navigation
     told = []
     film.record(
@@ -84,10 +84,10 @@ def test_a_film_shows_who_is_dead(navigation, tmp_path):
     for name, states in (("alive", rows), ("dead", dead)):
         film.record(env.spec, states, tmp_path / f"{name}.mp4", agent="random", size=(640, 360), fps=2)
         last[name] = iio.imread(tmp_path / f"{name}.mp4", plugin="FFMPEG", index=2).astype(float)
-    stage = Stage(Footage(env.spec, rows))
-    stage.dress(0.5)
-    places = np.stack([stage.cast.place(i) for i in range(4)])
-    pixel, _ = stage.camera(0.5).project(places, 640, 360)
+    scene = Scene(Trajectory(env.spec, rows))
+    scene.update(0.5)
+    places = np.stack([scene.visuals.place(i) for i in range(4)])
+    pixel, _ = scene.camera(0.5).project(places, 640, 360)
     change, colourful = [], []
     for x, y in pixel.round().astype(int):
         patch = {name: frame[y - 8 : y + 9, x - 12 : x + 13] for name, frame in last.items()}
@@ -108,19 +108,19 @@ def test_an_animated_picture_has_the_frames_and_their_duration(navigation, tmp_p
 
 _WITH_AND_WITHOUT_SKY = """
 import sys, mujoco, hipg_bench
-from hipg_bench.rendering.motion import Footage
-from hipg_bench.rendering.painter import Painter, views
-from hipg_bench.rendering.scene import Stage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.renderer import Renderer, views
+from hipg_bench.rendering.scene import Scene
 env = hipg_bench.make(sys.argv[1], 1, 0, threads=1)
 env.reset()
-footage = Footage(env.spec, env.rows)
-with Painter(footage.model, 640, 360) as painter:
-    (view,) = views(Stage(footage), [0.0], 360)
-    asked = bool(view.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX])
+trajectory = Trajectory(env.spec, env.rows)
+with Renderer(trajectory.model, 640, 360) as renderer:
+    (view,) = views(Scene(trajectory), [0.0], 360)
+    asked = bool(view.mjv_scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX])
     pictures = []
     for sky in (0, 1):
-        view.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
-        pictures.append(painter.paint(view.scene))
+        view.mjv_scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
+        pictures.append(renderer.render(view.mjv_scene))
 print(asked, bool((pictures[0] != pictures[1]).any()))
 """
 
@@ -129,7 +129,7 @@ print(asked, bool((pictures[0] != pictures[1]).any()))
 def test_the_sky_is_painted_where_it_can_be_seen(task):
     backend = gl.working_backend()
     if backend is None:
-        pytest.skip(f"no OpenGL works here; {gl.MEND}")
+        pytest.skip(f"no OpenGL works here; {gl.INSTALL_COMMAND}")
     done = subprocess.run(
         [sys.executable, "-c", _WITH_AND_WITHOUT_SKY, task],
         env=gl.environment(backend), capture_output=True, text=True, timeout=120, check=True,
@@ -145,7 +145,7 @@ def test_a_backend_that_does_not_exist_is_told(navigation, tmp_path):
     _, rows = navigation
     with pytest.raises(RenderError, match="MUJOCO_GL: nonsense") as caught:
         film.record("hazard_nav-4", rows, tmp_path / "a.mp4", agent="random", backend="nonsense")
-    assert gl.MEND not in str(caught.value), "nothing that could be installed is missing"
+    assert gl.INSTALL_COMMAND not in str(caught.value), "nothing that could be installed is missing"
     assert list(tmp_path.iterdir()) == []
     assert gl.working_backend(("nonsense",)) is None
 
@@ -208,18 +208,18 @@ def _within(seconds, condition):
 
 def test_at_a_row_the_picture_is_the_row(navigation):
     env, rows = navigation
-    footage = Footage(env.spec, rows)
-    data = mujoco.MjData(footage.model)
-    for row, moment in zip(rows, footage.time, strict=True):
-        footage.show(float(moment))
-        mujoco.mj_setState(footage.model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_kinematics(footage.model, data)
-        np.testing.assert_allclose(footage.data.xpos, data.xpos, atol=1e-12)
+    trajectory = Trajectory(env.spec, rows)
+    data = mujoco.MjData(trajectory.model)
+    for row, moment in zip(rows, trajectory.time, strict=True):
+        trajectory.show(float(moment))
+        mujoco.mj_setState(trajectory.model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_kinematics(trajectory.model, data)
+        np.testing.assert_allclose(trajectory.data.xpos, data.xpos, atol=1e-12)
 
 
 def test_between_rows_drones_are_where_the_physics_had_them(navigation):
     env, rows = navigation
-    footage = Footage(env.spec, rows)
+    trajectory = Trajectory(env.spec, rows)
     data = mujoco.MjData(env.model)
     limit = env.model.jnt_range
     curved, straight = [], []
@@ -233,9 +233,9 @@ def test_between_rows_drones_are_where_the_physics_had_them(navigation):
         free = (np.minimum(start, end) > limit[:, 0] + 0.05) & (np.maximum(start, end) < limit[:, 1] - 0.05)
         for substep in range(1, env.decimation):
             mujoco.mj_step(env.model, data)
-            footage.show(0.1 * (k + substep / env.decimation))
+            trajectory.show(0.1 * (k + substep / env.decimation))
             share = substep / env.decimation
-            curved.append(np.abs(footage.data.qpos - data.qpos)[free].max())
+            curved.append(np.abs(trajectory.data.qpos - data.qpos)[free].max())
             straight.append(np.abs((1 - share) * start + share * end - data.qpos)[free].max())
         mujoco.mj_step(env.model, data)
         np.testing.assert_allclose(data.qpos, end, atol=1e-9)
@@ -245,14 +245,14 @@ def test_between_rows_drones_are_where_the_physics_had_them(navigation):
 
 def test_bodies_turn_half_way_at_half_time():
     env, rows = played("multiwalker-3", 6)
-    footage = Footage(env.spec, rows)
-    root = footage.body("walker0/torso")
-    place = slice(*(footage.model.jnt_qposadr[footage.model.body_jntadr[root]] + np.array([3, 7])))
+    trajectory = Trajectory(env.spec, rows)
+    root = trajectory.body("walker0/torso")
+    place = slice(*(trajectory.model.jnt_qposadr[trajectory.model.body_jntadr[root]] + np.array([3, 7])))
     turns = np.zeros((3, 3))
     pose = []
     for moment in (0.08, 0.09, 0.10):
-        footage.show(moment)
-        pose.append(footage.data.qpos[place].copy())
+        trajectory.show(moment)
+        pose.append(trajectory.data.qpos[place].copy())
     assert np.linalg.norm(pose[1]) == pytest.approx(1)
     mujoco.mju_subQuat(turns[0], pose[2], pose[0])
     mujoco.mju_subQuat(turns[1], pose[1], pose[0])
@@ -263,28 +263,28 @@ def test_bodies_turn_half_way_at_half_time():
 def test_footage_ends_where_another_episode_begins():
     env, rows = played("coop_nav-3", 7, horizon=4)
     assert env.recall(rows, "elapsed")[:, 0].tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
-    footage = Footage(env.spec, rows)
-    assert len(footage.rows) == 4
-    live = Footage(env.spec, rows[:1])
+    trajectory = Trajectory(env.spec, rows)
+    assert len(trajectory.rows) == 4
+    live = Trajectory(env.spec, rows[:1])
     lengths = []
     for row in rows[1:]:
         live.append(row)
         lengths.append(len(live.rows))
     assert lengths == [2, 3, 4, 1, 2, 3, 4]
-    np.testing.assert_array_equal(live.body_position, Footage(env.spec, rows[4:]).body_position)
+    np.testing.assert_array_equal(live.body_position, Trajectory(env.spec, rows[4:]).body_position)
 
 
 def test_footage_knows_since_when(navigation):
     env, rows = navigation
     rows = np.concatenate([rows[:3], env.fork(rows[3:], {2: 0.0})])
     env.recall(rows, "revealed")[4:, 0] = 1.0
-    footage = Footage(env.spec, rows)
+    trajectory = Trajectory(env.spec, rows)
     # row 3 is at 0.3 s, row 4 at 0.4 s
-    np.testing.assert_allclose(footage.lifetime, [np.inf, np.inf, 0.3, np.inf])
-    assert footage.since("revealed", 0.35)[0] < 0
-    assert footage.since("revealed", 0.45)[0] == pytest.approx(0.05)
-    assert footage.remembered(0.29)["health"][2] == 1
-    assert footage.remembered(0.3)["health"][2] == 0
+    np.testing.assert_allclose(trajectory.lifetime, [np.inf, np.inf, 0.3, np.inf])
+    assert trajectory.since("revealed", 0.35)[0] < 0
+    assert trajectory.since("revealed", 0.45)[0] == pytest.approx(0.05)
+    assert trajectory.remembered(0.29)["health"][2] == 1
+    assert trajectory.remembered(0.3)["health"][2] == 0
 
 
 def test_rows_that_are_not_finite_are_refused(navigation):
@@ -292,7 +292,7 @@ def test_rows_that_are_not_finite_are_refused(navigation):
     bad = rows.copy()
     bad[2, 3] = np.nan
     with pytest.raises(RenderError, match="row 2"):
-        Footage(env.spec, bad)
+        Trajectory(env.spec, bad)
 
 
 # scenes
@@ -301,16 +301,16 @@ def test_rows_that_are_not_finite_are_refused(navigation):
 @pytest.mark.parametrize("task", sorted(hipg_bench.tasks()))
 def test_every_task_can_be_drawn_and_everyone_is_numbered(task):
     env, rows = played(task, 3)
-    stage = Stage(Footage(env.spec, env.fork(rows, {0: 0.0})))
-    scene = mujoco.MjvScene(stage.footage.model, maxgeom=8000)
-    shapes = scene.ngeom
-    stage.dress(2.5 * env.spec.control_step)
-    labels, status = stage.decorate(scene, 2.5 * env.spec.control_step)
+    scene = Scene(Trajectory(env.spec, env.fork(rows, {0: 0.0})))
+    mjv_scene = mujoco.MjvScene(scene.trajectory.model, maxgeom=8000)
+    shapes = mjv_scene.ngeom
+    scene.update(2.5 * env.spec.control_step)
+    labels, status = scene.decorate(mjv_scene, 2.5 * env.spec.control_step)
     words = [label.text for label in labels]
     assert "1 \N{MULTIPLICATION X}" in words
     # random actions may have killed others, too
     assert {str(agent + 1) for agent in range(env.num_agents)} <= {word.split()[0] for word in words}
-    assert scene.ngeom > shapes
+    assert mjv_scene.ngeom > shapes
     assert env.spec.family not in ("hazard_comm", "paper_comm", "multiwalker") or status
 
 
@@ -320,19 +320,19 @@ def test_every_family_has_a_look():
 
 def test_places_fall_where_mujoco_draws_them(navigation):
     env, rows = navigation
-    footage = Footage(env.spec, rows)
-    footage.show(0.0)
+    trajectory = Trajectory(env.spec, rows)
+    trajectory.show(0.0)
     camera = Camera(np.array([0.1, -0.2, 0.4]), 3.0, 70.0, -25.0)
-    scene, option = mujoco.MjvScene(footage.model, maxgeom=2000), mujoco.MjvOption()
+    mjv_scene, option = mujoco.MjvScene(trajectory.model, maxgeom=2000), mujoco.MjvOption()
     every = int(mujoco.mjtCatBit.mjCAT_ALL)
-    mujoco.mjv_updateScene(footage.model, footage.data, option, None, camera.mujoco(), every, scene)
-    eye, other = scene.camera[:2]
+    mujoco.mjv_updateScene(trajectory.model, trajectory.data, option, None, camera.mujoco(), every, mjv_scene)
+    eye, other = mjv_scene.camera[:2]
     ahead, up = np.asarray(eye.forward), np.asarray(eye.up)
-    gap = footage.data.xpos[1:5] - (np.asarray(eye.pos) + np.asarray(other.pos)) / 2
+    gap = trajectory.data.xpos[1:5] - (np.asarray(eye.pos) + np.asarray(other.pos)) / 2
     # pinhole: the picture's upper edge is at frustum_top when the plane at frustum_near is looked at
     scale = 180 / eye.frustum_top * eye.frustum_near / (gap @ ahead)
     expected = np.stack([320 + scale * (gap @ np.cross(ahead, up)), 180 - scale * (gap @ up)], axis=-1)
-    pixel, depth = camera.project(footage.data.xpos[1:5], 640, 360)
+    pixel, depth = camera.project(trajectory.data.xpos[1:5], 640, 360)
     np.testing.assert_allclose(pixel, expected, atol=0.01)
     np.testing.assert_allclose(depth, gap @ ahead, atol=1e-6)
 

@@ -277,7 +277,7 @@ def test_the_policy_file_is_what_acts(algorithm, tmp_path: Path) -> None:
     with torch.no_grad():
         choice = trainer.choose(trainer.norm(torch.from_numpy(observation)), torch.ones(alive.shape))
     np.testing.assert_allclose(action, trainer.pushes(choice), atol=3e-5)
-    assert np.abs(action).max() <= trainer.form.reach
+    assert np.abs(action).max() <= trainer.spec.reach
 
 
 def test_what_the_dead_are_told_counts_only_where_they_are_not_masked(algorithm, tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_a_sandbox_refuses_what_an_attacker_tries(tmp_path, name):
 
 
 def test_without_a_sandbox_the_same_attempts_succeed():
-    found = probe.trial(open_door)
+    found = probe.probe_backend(open_door)
     assert not found.works
     # memory alone is limited without a sandbox, too
     assert set(found.let_through) == set(ATTEMPTS) - {"4 GB of memory"}
@@ -131,8 +131,8 @@ def test_without_a_sandbox_the_same_attempts_succeed():
 
 @each_sandbox
 def test_a_sandbox_that_works_says_what_it_refuses(name):
-    assert probe.trial(choice.BACKENDS[name]) is choice.trials()[name]  # tried once per process
-    assert all(attempt in str(choice.trials()[name]) for attempt in ATTEMPTS)
+    assert probe.probe_backend(choice.BACKENDS[name]) is choice.probe_all()[name]  # tried once per process
+    assert all(attempt in str(choice.probe_all()[name]) for attempt in ATTEMPTS)
 
 
 def test_the_first_sandbox_that_works_is_chosen_and_none_is_refused(monkeypatch):
@@ -240,14 +240,14 @@ def _alive(pid):
 
 
 def test_the_doctor_says_how_each_sandbox_did(monkeypatch):
-    fine, broken = probe.Trial(seconds=0.3), probe.Trial(trouble="bwrap is not installed")
-    monkeypatch.setattr(choice, "trials", lambda: {"bubblewrap": broken, "landlock": fine})
+    fine, broken = probe.ProbeResult(seconds=0.3), probe.ProbeResult(trouble="bwrap is not installed")
+    monkeypatch.setattr(choice, "probe_all", lambda: {"bubblewrap": broken, "landlock": fine})
     found = {finding.name: finding for finding in doctor._sandbox()}
     assert [finding.level for finding in found.values()] == ["note", "ok"]
-    assert found["sandbox bubblewrap"].mend == "apt install bubblewrap"
+    assert found["sandbox bubblewrap"].fix == "apt install bubblewrap"
     assert "refuses read a file" in found["sandbox landlock"].text
-    leaky = probe.Trial(("TCP",))
-    monkeypatch.setattr(choice, "trials", lambda: {"bubblewrap": broken, "landlock": leaky})
+    leaky = probe.ProbeResult(("TCP",))
+    monkeypatch.setattr(choice, "probe_all", lambda: {"bubblewrap": broken, "landlock": leaky})
     findings = list(doctor._sandbox())
     assert [finding.level for finding in findings] == ["warning", "warning"]  # built-in agents can be scored
     assert "lets through TCP" in findings[1].text

@@ -101,8 +101,8 @@ def test_training_computes_in_single_precision_on_every_processor():
     """A product of 128 terms is within 1e-4 of double precision; with bfloat16 it would be 0.1 off."""
     code = """
 import torch
-from hipg_bench.learning import arithmetic
-arithmetic.prepare()
+from hipg_bench.learning import torch_setup
+torch_setup.configure()
 torch.manual_seed(0)
 a, b = torch.randn(512, 128), torch.randn(128, 128)
 print(float((a @ b - a.double() @ b.double()).abs().max()))

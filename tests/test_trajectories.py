@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from hipg_bench import make, task_spec
 from hipg_bench.cli import app
 from hipg_bench.errors import HipgError
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.trajectories import check_target, read_npz, trajectories, write
 from hipg_bench.policies.bundle import load_agent
 
@@ -18,14 +18,14 @@ from hipg_bench.policies.bundle import load_agent
 @pytest.fixture(scope="module", params=["multiwalker-3", "hazard_nav-4"])
 def played(request):
     spec = task_spec(request.param)
-    plan = Plan(seed=3, episodes=5, num_envs=3, threads=1)
+    job = EvaluationJob(seed=3, episodes=5, num_envs=3, threads=1)
     policy = load_agent("random").policy(spec)
-    return spec, plan, list(trajectories(spec, policy, plan))
+    return spec, job, list(trajectories(spec, policy, job))
 
 
 def test_returns_and_lengths_are_those_of_an_evaluation(played):
-    spec, plan, found = played
-    rows = plan.play_all(spec, load_agent("random").policy(spec))
+    spec, job, found = played
+    rows = job.play_all(spec, load_agent("random").policy(spec))
     assert [(one.seed, one.episode_id) for one in found] == [(3, k) for k in range(5)]
     for one, row in zip(found, rows, strict=True):
         assert len(one.reward) == len(one.action) == row["length"]

@@ -10,7 +10,7 @@ import pytest
 
 from hipg_bench.errors import ResumeError
 from hipg_bench.evaluation import runner
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.learning import checkpoint
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import recommended
@@ -24,7 +24,7 @@ TINY = {"num_envs": 2, "rollout": 8, "steps": 16}
 
 
 def evaluate(out, episodes=3):
-    return runner.evaluate(load_agent("zero"), SUITE, out, Plan(episodes=episodes, threads=1))
+    return runner.evaluate(load_agent("zero"), SUITE, out, EvaluationJob(episodes=episodes, threads=1))
 
 
 def everything(folder: Path) -> dict[str, bytes]:

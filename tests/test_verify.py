@@ -18,10 +18,10 @@ from hipg_bench.errors import BoardError, BundleError, ResumeError, SpecError
 from hipg_bench.evaluation import machines, protocol, runner
 from hipg_bench.leaderboard import adding
 from hipg_bench.leaderboard.board import Board
-from hipg_bench.leaderboard.playing import Match
+from hipg_bench.leaderboard.entry_view import read_board
+from hipg_bench.leaderboard.playing import BoardEvaluation
 from hipg_bench.leaderboard.rows import pack, parse_rows, unpack
 from hipg_bench.leaderboard.salt import new_salt, read_salt, reveal_salt
-from hipg_bench.leaderboard.shown import read_board
 from hipg_bench.leaderboard.source import opened
 from hipg_bench.leaderboard.verify import verify
 from hipg_bench.paths import data_folder
@@ -30,11 +30,11 @@ from hipg_bench.sandbox import choice
 from hipg_bench.submissions import archive
 
 TASK = "hazard_nav-4"
-MATCH = Match((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
-SHORT = Match((TASK,), ("standard",), episodes=3, threads=1)
+EVALUATION = BoardEvaluation((TASK,), ("standard", "forced_death"), episodes=6, threads=1)
+SHORT = BoardEvaluation((TASK,), ("standard",), episodes=3, threads=1)
 FROZEN = not protocol.differences()
 THANKS = 'authors = "A"\nlicense = "MIT"\n'
-SANDBOXED = any(trial.works for trial in choice.trials().values())
+SANDBOXED = any(result.works for result in choice.probe_all().values())
 
 
 def network(folder, name="newcomer"):
@@ -72,7 +72,7 @@ def zipped(folder):
     return path
 
 
-def add(board, what, match=MATCH, trust=False, **options):
+def add(board, what, match=EVALUATION, trust=False, **options):
     with opened(what, trust=trust) as source:
         return adding.add(board, source, match, **options).entry
 
@@ -119,8 +119,8 @@ def rows(tmp_path_factory, salted):
     """What the newcomer's own evaluation of six worlds gave, as the command writes it."""
     place = tmp_path_factory.mktemp("claims")
     with opened(salted[2]) as source:
-        for split in MATCH.splits:
-            runner.evaluate(source.agent, MATCH.suite(), place / split, MATCH.plan(split))
+        for split in EVALUATION.splits:
+            runner.evaluate(source.agent, EVALUATION.suite(), place / split, EVALUATION.job(split))
     return place
 
 
@@ -145,8 +145,8 @@ def test_a_zip_becomes_an_entry(salted):
     assert [row["world"] for row in found] == list(range(6))
     # the same rows as the agent plays by itself
     with opened(package) as source:
-        spec = MATCH.suite().specs[0]
-        own = MATCH.plan("standard").play_all(spec, source.agent.policy(spec, 0))
+        spec = EVALUATION.suite().specs[0]
+        own = EVALUATION.job("standard").play_all(spec, source.agent.policy(spec, 0))
     assert [row["return"] for row in found] == [row["return"] for row in own]
     # a curve is two columns of numbers, thinned, with the last point kept
     (points,) = shown.curves[TASK].values()
@@ -164,7 +164,7 @@ def test_what_is_true_is_verified_on_hidden_worlds(board, salted, tmp_path):
     assert (found.compared, found.differing) == (12, 0)
     (shown,) = read_board(board)
     assert (shown.status, shown.worlds) == ("verified", "hidden")
-    for split in MATCH.splits:
+    for split in EVALUATION.splits:
         public = shown.rows("public", split, TASK)
         kept = tmp_path / "private" / "newcomer" / "v1" / f"hidden/{split}/episodes/{TASK}.jsonl.gz"
         hidden = [json.loads(line) for line in unpack(kept).splitlines()]
@@ -180,7 +180,7 @@ def test_what_is_true_is_verified_on_hidden_worlds(board, salted, tmp_path):
         message = f"hipg-1|{split}|{TASK}|0".encode()
         inner = hashlib.sha256(bytes(b ^ 0x36 for b in salt.ljust(64, b"\0")) + message).digest()
         digest = hashlib.sha256(bytes(b ^ 0x5C for b in salt.ljust(64, b"\0")) + inner).digest()
-        assert MATCH.plan(split, salt).eval_seed(TASK, 0) == int.from_bytes(digest[:8], "big") >> 1
+        assert EVALUATION.job(split, salt).eval_seed(TASK, 0) == int.from_bytes(digest[:8], "big") >> 1
     published = b"".join(
         unpack(path) if path.suffix == ".gz" else path.read_bytes()
         for path in board.root.rglob("*") if path.is_file()
@@ -192,7 +192,7 @@ def test_what_is_true_is_verified_on_hidden_worlds(board, salted, tmp_path):
     result = json.loads((shown.folder / "hidden/standard/results.json").read_text())
     scores = [run["score"] for task in result["tasks"] for run in task["runs"]]
     assert scores == [float(f"{score:.3g}") for score in scores]
-    seed = MATCH.plan("standard", salt).eval_seed(TASK, 0)
+    seed = EVALUATION.job("standard", salt).eval_seed(TASK, 0)
     assert salt.hex().encode() not in published
     assert str(seed).encode() not in published
     # verified twice, it is the same entry once, with no history
@@ -230,10 +230,12 @@ def test_true_claims_are_verified(tmp_path, salted, rows):
 def test_the_seed_that_an_agent_is_told_differs_at_each_verification():
     """In hidden worlds: else a throw-away submission could learn to recognise them."""
     salt = bytes(range(32))
-    plans = [MATCH.plan("standard", salt, luck) for luck in ("one|1|2026", "one|1|2027")]
-    assert len({plan.agent_seed(TASK, 0) for plan in plans}) == 2
-    assert len({plan.eval_seed(TASK, 0) for plan in plans}) == 1
-    assert MATCH.plan("standard").agent_seed(TASK, 0) == 1000
+    jobs = [
+        EVALUATION.job("standard", salt, agent_seed_key) for agent_seed_key in ("one|1|2026", "one|1|2027")
+    ]
+    assert len({job.agent_seed(TASK, 0) for job in jobs}) == 2
+    assert len({job.eval_seed(TASK, 0) for job in jobs}) == 1
+    assert EVALUATION.job("standard").agent_seed(TASK, 0) == 1000
 
 
 def test_copies_of_one_training_are_not_several(tmp_path):

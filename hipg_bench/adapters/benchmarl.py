@@ -21,7 +21,7 @@ from tensordict import TensorDictBase
 from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-from hipg_bench.adapters.named import numbered
+from hipg_bench.adapters.agent_names import numbered
 from hipg_bench.adapters.torchrl import HipgEnv
 from hipg_bench.errors import SpecError
 from hipg_bench.registry import task_spec, tasks

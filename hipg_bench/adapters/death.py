@@ -1,4 +1,4 @@
-"""What death means where agents are paid one by one: the rules that faces which keep the dead share.
+"""What death means where agents are paid one by one: the rules that adapters which keep the dead share.
 
 A dead agent stays in the team to the end of the episode: it sees its own health 0 and zeros, and what it is
 told is ignored. It is paid for the step in which it dies and, unless the task says ``reward_dead = "team"``,

@@ -17,8 +17,8 @@ import numpy as np
 from dm_env import specs
 
 from hipg_bench.adapters import death
+from hipg_bench.adapters.agent_names import gather, numbered
 from hipg_bench.adapters.joint import split_action
-from hipg_bench.adapters.named import gather, numbered
 from hipg_bench.env import Step
 from hipg_bench.errors import ActionError
 from hipg_bench.registry import make, tasks

@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Float, UInt8
 
 from hipg_bench.adapters import death
-from hipg_bench.adapters.named import checked_name, gather, numbered
+from hipg_bench.adapters.agent_names import checked_name, gather, numbered
 from hipg_bench.env import Step
 from hipg_bench.errors import HipgError, SpecError, hint
 from hipg_bench.registry import make, tasks

@@ -20,7 +20,7 @@ from gymnasium.spaces import Box
 from jaxtyping import UInt8
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
-from hipg_bench.adapters.named import gather, numbered
+from hipg_bench.adapters.agent_names import gather, numbered
 from hipg_bench.env import Step
 from hipg_bench.errors import HipgError, SpecError
 from hipg_bench.registry import make, tasks

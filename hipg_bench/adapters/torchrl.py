@@ -18,7 +18,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from hipg_bench.adapters import death
-from hipg_bench.adapters.named import numbered
+from hipg_bench.adapters.agent_names import numbered
 from hipg_bench.arguments import MOST_SEED, whole
 from hipg_bench.env import Step
 from hipg_bench.errors import HipgError

@@ -83,7 +83,7 @@ def _program(
         typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Teams that lose members: 3D tasks, trained teams, scores and films."""
+    """Benchmark for multi-agent teams that lose members: tasks, training, evaluation and videos."""
 
 
 app.command()(evaluate.evaluate)
@@ -107,7 +107,7 @@ app.command()(doctor.doctor)
 
 
 def main() -> None:
-    """Run the command line; mistakes are told in one line, with exit code 2, and interruptions with 130."""
+    """Run the command line. Errors are one line and exit code 2; an interruption exits with 130."""
     _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

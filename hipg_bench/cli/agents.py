@@ -8,14 +8,14 @@ import typer
 
 from hipg_bench.cli import console
 
-app = typer.Typer(help="List the bundled agents; show one.", no_args_is_help=False)
+app = typer.Typer(help="List the bundled agents, or show one.", no_args_is_help=False)
 
-AsJson = Annotated[bool, typer.Option("--json", help="For scripts.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
 
 @app.callback(invoke_without_command=True)
 def agents(context: typer.Context, as_json: AsJson = False) -> None:
-    """List the bundled agents; show one."""
+    """List the bundled agents, or show one."""
     if context.invoked_subcommand is not None:
         return
     from hipg_bench.policies import bundle
@@ -35,7 +35,7 @@ def show(
     agent: Annotated[str, typer.Argument(help="A bundled agent's name, or the path of a bundle.")],
     as_json: AsJson = False,
 ) -> None:
-    """Print what a bundle says of itself, and which tasks it plays."""
+    """Show an agent's card and the tasks that it plays."""
     from hipg_bench.policies.bundle import load_agent
 
     facts = _facts(load_agent(agent))

@@ -20,21 +20,28 @@ _NOISE_WORLDS = 8
 
 
 def audit(
-    run: Annotated[Path | None, typer.Option(help="Folder of a training run of one's own, or")] = None,
-    agent: Annotated[str | None, typer.Option(help="a bundled agent's name or a bundle's folder,")] = None,
-    task: Annotated[str | None, typer.Option(help="with the task,")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="and the training seed.")] = 0,
+    run: Annotated[Path | None, typer.Option(help="Folder of a training run.")] = None,
+    agent: Annotated[
+        str | None, typer.Option(help="A bundled agent's name or a bundle's folder, instead of --run.")
+    ] = None,
+    task: Annotated[
+        str | None, typer.Option(help="Task whose networks are audited; needed with --agent.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Training seed of the networks; used with --agent.")] = 0,
     worlds: Annotated[
-        int, typer.Option(min=1, help="Episodes that states are taken from; 8 times as many for the noise.")
+        int,
+        typer.Option(
+            min=1, help="Episodes that states are sampled from. The gradient noise uses 8 times as many."
+        ),
     ] = 32,
-    moments: Annotated[int, typer.Option(min=1, help="States per episode.")] = 4,
-    repeats: Annotated[int, typer.Option(min=2, help="Rollouts per state and dead agent.")] = 8,
-    luck: Annotated[int, typer.Option(min=0, help="Seed of the episodes and of all luck.")] = 500,
-    threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
-    plot: Annotated[Path | None, typer.Option(help="Calibration plot to write, a PNG.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    moments: Annotated[int, typer.Option(min=1, help="Sampled states per episode.")] = 4,
+    repeats: Annotated[int, typer.Option(min=2, help="Rollouts per state and removed agent.")] = 8,
+    rollout_seed: Annotated[int, typer.Option(min=0, help="Random seed of the rollouts.")] = 500,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of PyTorch.")] = 1,
+    plot: Annotated[Path | None, typer.Option(help="Write a calibration plot to this PNG file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Compare a critic's counterfactuals with worlds in which the agent really is dead."""
+    """Compare a critic's counterfactual values with rollouts of forked worlds, and measure gradient noise."""
     import torch
 
     from hipg_bench.learning import audit as audits
@@ -43,8 +50,10 @@ def audit(
     torch.set_num_threads(threads)
     source = _source(run, agent, task, seed)
     actor, critic, settings = audits.load(source)
-    found = audits.audit(actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=luck)
-    noise = gradient_noise(actor, critic, settings, worlds=_NOISE_WORLDS * worlds, seed=luck)
+    found = audits.audit(
+        actor, critic, settings, worlds=worlds, moments=moments, repeats=repeats, seed=rollout_seed
+    )
+    noise = gradient_noise(actor, critic, settings, worlds=_NOISE_WORLDS * worlds, seed=rollout_seed)
     if plot is not None:
         audits.draw(found, plot, title=f"{settings.task}, {settings.algorithm}, seed {settings.seed}")
     if as_json:
@@ -120,8 +129,8 @@ def _print_noise(found: GradientNoise) -> None:
         low, high = found.interval[name]
         rows.add_row(name, console.number(found.noise[name], 3), f"{low:.2f} to {high:.2f}", about)
     console.show(rows)
-    scale = "no signal seen" if found.scale is None else f"as much noise as signal at {found.scale:,.0f}"
-    console.say(f"{found.episodes} episodes; under V(s) {scale}")
+    scale = "unknown" if found.scale is None else f"{found.scale:,.0f}"
+    console.say(f"{found.episodes} episodes; noise scale (episodes) with the baseline V(s): {scale}")
 
 
 def _facts(found: Audit) -> dict[str, object]:

@@ -15,7 +15,7 @@ from hipg_bench.errors import UnknownNameError, hint
 
 if TYPE_CHECKING:
     from hipg_bench.evaluation.bench.child import Job
-    from hipg_bench.evaluation.bench.plan import Request
+    from hipg_bench.evaluation.bench.plan import BenchmarkPlan
 
 _PICTURES = (".png", ".svg", ".pdf")
 _MEMORY = {">peak MB": "{peak_mb:,.0f}"}
@@ -77,8 +77,8 @@ _COLUMNS: Mapping[str, dict[str, str]] = {
         ">beyond python": "{beyond_python_ms:,.0f}",
         "slowest imports, ms": "{imports}",
     },
-    "faces": {
-        "face": "{face}",
+    "adapters": {
+        "adapter": "{adapter}",
         "task": "{task}",
         ">threads": "{threads}",
         ">worlds": "{num_envs}",
@@ -102,26 +102,36 @@ _COLUMNS: Mapping[str, dict[str, str]] = {
 def bench(
     sections: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[SECTION]...", help=f"Some of: {', '.join(_COLUMNS)}. All by default."),
+        typer.Argument(
+            metavar="[SECTION]...", help=f"Sections to measure: {', '.join(_COLUMNS)}. [default: all]"
+        ),
     ] = None,
     tasks: Annotated[
         str | None,
-        typer.Option(help="Task names with commas between, or: standard, paper, all. [default: standard]"),
+        typer.Option(help="Comma-separated task names, or standard, paper or all. [default: standard]"),
     ] = None,
     num_envs: Annotated[
-        str | None, typer.Option(help="Batch sizes with commas between. [default: 1,64,1024]")
+        str | None, typer.Option(help="Comma-separated numbers of worlds. [default: 1,64,1024]")
     ] = None,
     threads: Annotated[
-        str | None, typer.Option(help="Physics threads with commas between, 0 for all cores. [default: 0]")
+        str | None,
+        typer.Option(help="Comma-separated numbers of physics threads; 0 uses all cores. [default: 0]"),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.05, help="Per measurement. [default: 1]")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.05, help="Seconds per measurement. [default: 1]")
+    ] = None,
     full: Annotated[
-        bool, typer.Option("--full", help="All tasks, up to 4096 worlds, 1 to all threads; half an hour.")
+        bool,
+        typer.Option(
+            "--full", help="Measure all tasks, up to 4096 worlds and 1 to all threads; takes half an hour."
+        ),
     ] = False,
-    plot: Annotated[Path | None, typer.Option(help="Also draw how speed scales, .png, .svg or .pdf.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One document for scripts.")] = False,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw how speed scales into this .png, .svg or .pdf file.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Measure speed and memory, each beside what bounds it, in turn in the same run."""
+    """Measure speed and memory, each beside its upper bound."""
     wanted = _checked_sections(sections)
     if plot is not None and plot.suffix.lower() not in _PICTURES:
         raise typer.BadParameter(
@@ -135,7 +145,7 @@ def bench(
     from hipg_bench.evaluation.bench.machine import machine
 
     specs = suite_of(tasks or ("all" if full else "standard")).specs
-    asked = plan.request(specs, num_envs=batches, threads=counts, seconds=seconds, full=full)
+    asked = plan.make_plan(specs, num_envs=batches, threads=counts, seconds=seconds, full=full)
     jobs = {name: _jobs(name, asked) for name in wanted}
     rows: dict[str, list[Any]] = {name: [] for name in wanted}
     host, started = machine(), time.monotonic()
@@ -168,7 +178,7 @@ def _checked_sections(sections: list[str] | None) -> list[str]:
     return [name for name in _COLUMNS if not sections or name in sections]
 
 
-def _jobs(section: str, asked: Request) -> list[Job]:
+def _jobs(section: str, asked: BenchmarkPlan) -> list[Job]:
     """The measurements of a section."""
     from hipg_bench.evaluation.bench import plan
     from hipg_bench.evaluation.bench.child import Job
@@ -191,7 +201,7 @@ def _show(section: str, rows: list[Any]) -> None:
     for row in rows:
         values = dataclasses.asdict(row)
         if left_out := values.get("left_out"):
-            console.warn(f"{values['face']}: left out, {left_out}")
+            console.warn(f"{values['adapter']}: left out, {left_out}")
             continue
         shown.add_row(*(template.format(**values) for template in columns.values()))
     console.show(shown)

@@ -24,14 +24,15 @@ def calibrate(
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
     split: Annotated[
-        str, typer.Option(help="Or only the anchors in: shift, forced_death, ad_hoc.")
+        str,
+        typer.Option(help="Split: standard, or measure only the anchors of shift, forced_death or ad_hoc."),
     ] = "standard",
-    episodes: Annotated[int, typer.Option(min=1, help="Per measured policy.")] = 1000,
-    threads: Annotated[int, typer.Option(min=0, help="Physics threads, 0 for all cores.")] = 0,
-    write: Annotated[bool, typer.Option("--write", help="Write the numbers into the task file.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per measured policy.")] = 1000,
+    threads: Annotated[int, typer.Option(min=0, help="Physics threads; 0 uses all cores.")] = 0,
+    write: Annotated[bool, typer.Option("--write", help="Write the results into the task file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Measure a task's anchors, its hazard leverage, and what policies without eyes score."""
+    """Measure a task's score anchors, its hazard sensitivity and the scores of open-loop baselines."""
     from hipg_bench.evaluation import calibration
     from hipg_bench.paths import data_folder, is_installed
 
@@ -112,16 +113,18 @@ def _print(measured: Calibration) -> None:
             console.interval(ends, 3),
             _wanted(score < 0.2, "< 0.2") if probe and standard else "",
         )
-    if "hazard_leverage" in facts:
-        leverage = facts["hazard_leverage"]
+    if "hazard_sensitivity" in facts:
+        sensitivity = facts["hazard_sensitivity"]
         rows.add_row(
-            "hazard leverage",
-            f"{leverage:.3f}",
+            "hazard sensitivity",
+            f"{sensitivity:.3f}",
             "",
-            _wanted(leverage >= 0.25, ">= 0.25") if standard else "",
-            "score, hazard off - blind",
+            _wanted(sensitivity >= 0.25, ">= 0.25") if standard else "",
+            "score of the hazard-unaware expert without and with the hazard",
         )
-        rows.add_row("deaths, blind", f"{facts['blind_deaths']:.3f}", "", "", "per agent and episode")
+        rows.add_row(
+            "deaths, hazard-unaware", f"{facts['hazard_unaware_deaths']:.3f}", "", "", "per agent and episode"
+        )
     rows.add_row("deaths, random", f"{facts['random_deaths']:.3f}", "", "", "per agent and episode")
     console.show(rows)
 

@@ -11,26 +11,28 @@ from hipg_bench.cli import console
 
 
 def collect(
-    sweep: Annotated[Path, typer.Option(help="The sweep's file.")],
-    runs: Annotated[Path, typer.Option(help="The folder its runs lie in: train's --out.")],
-    agents: Annotated[Path, typer.Option(help="The folder of bundles to add to.")] = Path("agents"),
+    sweep: Annotated[Path, typer.Option(help="The sweep file.")],
+    runs: Annotated[Path, typer.Option(help="Folder of the sweep's runs, the --out of train.")],
+    agents: Annotated[Path, typer.Option(help="Folder of agent bundles that the runs are added to.")] = Path(
+        "agents"
+    ),
     replace: Annotated[
-        bool, typer.Option("--replace", help="Let other weights of the same seed give way.")
+        bool, typer.Option("--replace", help="Overwrite existing weights of the same seed.")
     ] = False,
-    episodes: Annotated[int, typer.Option(min=1, help="That the score of a team is of.")] = 320,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes per score.")] = 320,
 ) -> None:
-    """Make agent bundles of a sweep's finished runs: weights, records, curves, scores and cards."""
+    """Make agent bundles from a sweep's finished runs: weights, records, curves, scores and cards."""
     from collections import Counter
 
     from hipg_bench.comparison import artefacts
-    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.evaluation.episodes import EvaluationJob
     from hipg_bench.learning.sweep import load
 
     found = load(sweep, runs)
     states: Counter[str] = Counter()
     with console.progress() as bars:
         bar = bars.add_task("collecting", total=len(found))
-        for one in artefacts.collect(found, agents, replace=replace, plan=Plan(episodes=episodes)):
+        for one in artefacts.collect(found, agents, replace=replace, job=EvaluationJob(episodes=episodes)):
             bars.advance(bar)
             states[one.state] += 1
             if one.state in _TOLD:

@@ -105,19 +105,19 @@ def _evaluated(agent: Agent, tasks: list[str], worlds: Mapping[str, Any]) -> Pat
     """The folder of an evaluation; one of the same policies in the same worlds is used again."""
     from hipg_bench import registry
     from hipg_bench.evaluation import runner
-    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.evaluation.episodes import EvaluationJob
 
     specs = tuple(registry.task_spec(task) for task in tasks)
     policies = [agent.fingerprint(spec.task, k) for spec in specs for k in agent.train_seeds(spec.task)]
     key = json.dumps([worlds, policies, [(spec.task, spec.fingerprint) for spec in specs]])
     digest = hashlib.sha256(key.encode()).hexdigest()[:8]
     folder = Path("runs") / f"compare-{agent.name}-{digest}"
-    plan = Plan(**worlds)
+    job = EvaluationJob(**worlds)
     with console.progress() as bars:
-        totals = {task: plan.episodes * len(agent.train_seeds(task)) for task in tasks}
+        totals = {task: job.episodes * len(agent.train_seeds(task)) for task in tasks}
         ids = {task: bars.add_task(task, total=total) for task, total in totals.items()}
         runner.evaluate(
-            agent, runner.Suite("custom", specs), folder, plan,
+            agent, runner.Suite("custom", specs), folder, job,
             progress=lambda stage, done: bars.advance(ids[stage], done) if stage in ids else None,
         )  # fmt: skip
     return folder

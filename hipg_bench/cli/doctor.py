@@ -12,9 +12,9 @@ _STYLE = {"ok": "green", "note": "dim", "warning": "yellow", "broken": "bold red
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Try what this suite needs; say how to mend what does not work. Exit code 1 if scoring cannot work."""
+    """Check what works on this machine and how to fix what does not. Exits with 1 if scoring fails."""
     from rich.text import Text
 
     from hipg_bench.evaluation import doctor as clinic
@@ -30,13 +30,11 @@ def doctor(
             style = _STYLE[finding.level]
             rows.add_row(Text(finding.level, style), finding.name, finding.text)
         console.show(rows)
-        mends = {
-            finding.mend: finding.name for finding in findings if finding.mend and finding.level != "note"
-        }
-        if mends:
-            console.say("\nTo mend it, run:")
-            for mend, name in mends.items():
-                console.say(f"  {mend}    # {name}")
+        fixes = {finding.fix: finding.name for finding in findings if finding.fix and finding.level != "note"}
+        if fixes:
+            console.say("\nTo fix it, run:")
+            for fix, name in fixes.items():
+                console.say(f"  {fix}    # {name}")
         else:
             console.say("\nNothing is wrong.")
     if not clinic.healthy(findings):

@@ -13,7 +13,7 @@ from hipg_bench.cli import console
 from hipg_bench.cli.options import AgentOption, NumAgentsOption, SetOption, calibrate_hint, task_of
 
 if TYPE_CHECKING:
-    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.evaluation.episodes import EvaluationJob
     from hipg_bench.evaluation.runner import Suite
     from hipg_bench.policies.bundle import Agent
 
@@ -34,28 +34,36 @@ def evaluate(
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
     split: Annotated[
-        str, typer.Option(help="standard, shift, forced_death, ad_hoc, or all, a folder for each.")
+        str,
+        typer.Option(
+            help="Split: standard, shift, forced_death, ad_hoc, or all, which writes one folder per split."
+        ),
     ] = "standard",
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per task and training seed.")] = 320,
     seed: Annotated[int, typer.Option(min=0, help="Evaluation seed of the first 64 worlds.")] = 1000,
     num_envs: Annotated[
-        int, typer.Option(min=1, help="Worlds at a time, at most 64; no result depends on it.")
+        int, typer.Option(min=1, help="Worlds simulated at once, at most 64. Results do not depend on it.")
     ] = 64,
     threads: Annotated[
-        int, typer.Option(min=0, help="Physics threads, 0 for all cores; no result depends on it.")
+        int, typer.Option(min=0, help="Physics threads; 0 uses all cores. Results do not depend on it.")
     ] = 0,
-    out: Annotated[Path | None, typer.Option(help="Folder; one of an interrupted run is resumed.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder. An interrupted evaluation in it is resumed.")
+    ] = None,
     video: Annotated[
-        int | None, typer.Option(min=0, help="Films per task; by default 1, with --quick 0.")
+        int | None, typer.Option(min=0, help="Videos per task; by default 1, or 0 with --quick.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="A look: 32 episodes and no films, not for comparison.")
+        bool,
+        typer.Option(
+            "--quick", help="Play 32 episodes without videos, for a first look and not for comparisons."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
 ) -> None:
-    """Score an agent on tasks, with films and a report."""
+    """Evaluate an agent on tasks; write scores, episode rows, videos and a report."""
     from hipg_bench.evaluation import runner, splits
-    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.evaluation.episodes import EvaluationJob
     from hipg_bench.paths import new_folder
     from hipg_bench.policies.trained import Trained, find_agent
 
@@ -63,7 +71,7 @@ def evaluate(
     if tasks is None:
         tasks = ",".join(who.tasks) if isinstance(who, Trained) and who.tasks else "standard"
     suite = suite_of(tasks, num_agents, setting)
-    plan = Plan(seed, _QUICK if quick else episodes, num_envs, threads)
+    job = EvaluationJob(seed, _QUICK if quick else episodes, num_envs, threads)
     films = (0 if quick else 1) if video is None else video
     for name in splits.SPLITS if split == "all" else (split,):
         runner.playable(who, suite, name)
@@ -71,24 +79,24 @@ def evaluate(
     parts = {name: folder / name for name in splits.SPLITS} if split == "all" else {split: folder}
     every: dict[str, Any] = {}
     for name, part in parts.items():
-        split_plan = dataclasses.replace(plan, split=name)
+        split_plan = dataclasses.replace(job, split=name)
         every[name] = _evaluate(who, suite, part, split_plan, films, silent=as_json)
     if as_json:
         console.show_json(every if split == "all" else every[split])
 
 
 def _evaluate(
-    who: Agent, suite: Suite, folder: Path, plan: Plan, films: int, *, silent: bool
+    who: Agent, suite: Suite, folder: Path, job: EvaluationJob, films: int, *, silent: bool
 ) -> dict[str, Any]:
     """One split, with a bar for each task; scores are printed as they come, and before the films."""
     from hipg_bench.evaluation import runner
 
-    seeds, skipped = runner.playable(who, suite, plan.split)
+    seeds, skipped = runner.playable(who, suite, job.split)
     if not silent:
-        console.say(f"{who.name} on {suite.name}, {plan.split}: {who.summary}\n")
+        console.say(f"{who.name} on {suite.name}, {job.split}: {who.summary}\n")
         console.say(_line("task", "score", "", "return", "survival", "deaths", "ended by"))
     with console.progress() as bars:
-        totals = {task: plan.episodes * len(found) for task, found in seeds.items()}
+        totals = {task: job.episodes * len(found) for task, found in seeds.items()}
         if films:
             totals["films"] = films * len(seeds)
         ids = {name: bars.add_task(name, total=total) for name, total in totals.items()}
@@ -105,7 +113,7 @@ def _evaluate(
 
         try:
             results = runner.evaluate(
-                who, suite, folder, plan, films_per_task=films,
+                who, suite, folder, job, films_per_task=films,
                 progress=lambda stage, done: bars.advance(ids[stage], done) if stage in ids else None,
                 played_task=runner.unheard if silent else played, scored=runner.unheard if silent else scored,
             )  # fmt: skip

@@ -11,10 +11,12 @@ from hipg_bench.cli import console
 
 
 def export(
-    folders: Annotated[list[Path], typer.Argument(help="What `evaluate` wrote: an agent and a split each.")],
-    out: Annotated[Path, typer.Option(help="File to write.")] = Path("marl_eval.json"),
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders written by `evaluate`, one per agent and split.")
+    ],
+    out: Annotated[Path, typer.Option(help="Output file.")] = Path("marl_eval.json"),
 ) -> None:
-    """Write evaluations of several agents as the JSON that marl-eval reads."""
+    """Write evaluations of several agents in the JSON format of marl-eval."""
     import json
 
     from hipg_bench.evaluation.export import marl_eval

@@ -14,17 +14,18 @@ from hipg_bench.errors import HipgError
 
 
 def figures(
-    out: Annotated[Path, typer.Option(help="Folder for figures and verdicts.json.")] = Path(
+    out: Annotated[Path, typer.Option(help="Output folder for figures and verdicts.json.")] = Path(
         "docs/comparison"
     ),
-    agents: Annotated[Path, typer.Option(help="The folder of bundles whose curves are compared.")] = Path(
-        "agents"
-    ),
+    agents: Annotated[
+        Path, typer.Option(help="Folder of the agent bundles whose curves are compared.")
+    ] = Path("agents"),
     page: Annotated[
-        Path | None, typer.Option(help="A page whose results are written anew, such as docs/comparison.md.")
+        Path | None,
+        typer.Option(help="Page whose section of results is rewritten, such as docs/comparison.md."),
     ] = None,
 ) -> None:
-    """Draw the paper's figures from the bundles' curves, and judge its claims."""
+    """Draw the paper's figures from the bundles' learning curves and test its claims."""
     from hipg_bench.comparison import claims
     from hipg_bench.comparison import page as pages
     from hipg_bench.comparison.figures import draw_all

@@ -16,52 +16,57 @@ from hipg_bench.cli import console
 
 if TYPE_CHECKING:
     from hipg_bench.leaderboard.entry import Verification
-    from hipg_bench.leaderboard.playing import Match
+    from hipg_bench.leaderboard.playing import BoardEvaluation
 
-app = typer.Typer(help="Scores that others can trust: add, verify, build, serve.", no_args_is_help=True)
-salts = typer.Typer(help="The secret behind the hidden worlds.", no_args_is_help=True)
+app = typer.Typer(
+    help="Add agents to the leaderboard, verify their scores, build its website.", no_args_is_help=True
+)
+salts = typer.Typer(help="Manage the secret salt that determines the hidden worlds.", no_args_is_help=True)
 app.add_typer(salts, name="salt")
 
 BoardFolder = Annotated[Path, typer.Option("--board", help="The board's folder.")]
-Salt = Annotated[Path, typer.Option("--salt-file", help="The salt; it lies outside any repository.")]
+Salt = Annotated[
+    Path, typer.Option("--salt-file", help="File with the secret salt, stored outside any repository.")
+]
 Threads = Annotated[
-    int, typer.Option(min=0, help="Physics threads, 0 for all cores; no result depends on it.")
+    int, typer.Option(min=0, help="Physics threads; 0 uses all cores. Results do not depend on it.")
 ]
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Run its code without a sandbox: agents of your own; never verified.")
+    bool,
+    typer.Option(
+        "--trust", help="Run the agent's code without a sandbox; only for your own code, and never verified."
+    ),
 ]
 BOARD = Path("leaderboard")
 
 
 @app.command()
 def add(
-    what: Annotated[str, typer.Argument(help="A zip or folder of a submission, or a bundled agent's name.")],
+    what: Annotated[str, typer.Argument(help="A submission's zip or folder, or a bundled agent's name.")],
     board: BoardFolder = BOARD,
     claims: Annotated[
-        Path | None, typer.Option(help="The submitter's own rows: a folder with <split>/episodes/.")
+        Path | None, typer.Option(help="Folder with the submitter's own episode rows in <split>/episodes/.")
     ] = None,
-    splits: Annotated[str, typer.Option(help="Splits with commas between, or: all.")] = "all",
-    tasks: Annotated[str, typer.Option(help="Task names with commas between, or: standard.")] = "standard",
-    episodes: Annotated[
-        int, typer.Option(min=3, help="Worlds per policy; fewer than 320 are for trying out.")
-    ] = 320,
-    films: Annotated[str, typer.Option(help="Tasks to film, with commas between, or: all, none.")] = "all",
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Take the place of the entry of that name.")
-    ] = False,
+    splits: Annotated[str, typer.Option(help="Comma-separated splits, or all.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Comma-separated task names, or standard.")] = "standard",
+    episodes: Annotated[int, typer.Option(min=3, help="Worlds per policy; a full entry has 320.")] = 320,
+    films: Annotated[
+        str, typer.Option(help="Comma-separated tasks to record videos of, or all, or none.")
+    ] = "all",
+    replace: Annotated[bool, typer.Option("--replace", help="Overwrite the entry of the same name.")] = False,
     trust: Trust = False,
     threads: Threads = 0,
 ) -> None:
-    """Make an agent an entry, self-reported: it plays the public worlds, or its rows come along."""
+    """Add an agent as a self-reported entry: evaluate it in the public worlds, or import its rows."""
     from hipg_bench.leaderboard import adding
     from hipg_bench.leaderboard.board import Board
     from hipg_bench.leaderboard.source import opened
 
-    match, store = _match(splits, tasks, episodes, threads), Board(board)
+    evaluation, store = _evaluation(splits, tasks, episodes, threads), Board(board)
     with store.workspace("add") as place, opened(what, place, trust=trust) as source, _telling() as progress:
         added = adding.add(
-            store, source, match, claims=claims, replace=replace,
-            film_tasks=_filmed(films, match), progress=progress,
+            store, source, evaluation, claims=claims, replace=replace,
+            film_tasks=_filmed(films, evaluation), progress=progress,
         )  # fmt: skip
     _tell_trouble(added.trouble)
     entry = added.entry
@@ -79,7 +84,7 @@ def verify(
     trust: Trust = False,
     threads: Threads = 0,
 ) -> None:
-    """Play an entry again: are its rows true, and how does it do on hidden worlds?"""
+    """Verify an entry: reproduce its public rows, then evaluate it in hidden worlds."""
     from hipg_bench.leaderboard import verify as verifying
     from hipg_bench.leaderboard.board import Board
     from hipg_bench.leaderboard.salt import private_folder, read_salt
@@ -96,10 +101,13 @@ def verify(
 
 @app.command()
 def build(
-    out: Annotated[Path, typer.Option(help="Folder for the site; one of ours is replaced.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="Output folder of the website. A website that this command built is overwritten."),
+    ],
     board: BoardFolder = BOARD,
 ) -> None:
-    """Write the page: a static site that needs no server and no network."""
+    """Build the leaderboard as a static website that works offline."""
     from hipg_bench.leaderboard import site
     from hipg_bench.leaderboard.board import Board
 
@@ -113,9 +121,9 @@ def build(
 @app.command()
 def serve(
     board: BoardFolder = BOARD,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port, 0 for any free one.")] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8000,
 ) -> None:
-    """Build the page and show it at this machine only."""
+    """Build the website and serve it on this machine only."""
     from hipg_bench.leaderboard import site
     from hipg_bench.leaderboard.board import Board
 
@@ -132,14 +140,16 @@ def serve(
 @app.command()
 def refresh(
     salt_file: Annotated[
-        Path | None, typer.Option("--salt-file", help="With it they are verified too.")
+        Path | None, typer.Option("--salt-file", help="Also verify the entries with this salt file.")
     ] = None,
     board: BoardFolder = BOARD,
     episodes: Annotated[int, typer.Option(min=3, help="Worlds per policy.")] = 320,
-    films: Annotated[str, typer.Option(help="Tasks to film, with commas between, or: all, none.")] = "all",
+    films: Annotated[
+        str, typer.Option(help="Comma-separated tasks to record videos of, or all, or none.")
+    ] = "all",
     threads: Threads = 0,
 ) -> None:
-    """Make the entries of all bundled agents anew, in place of those on the board."""
+    """Recreate the entries of all bundled agents, overwriting those on the board."""
     from hipg_bench.leaderboard import adding
     from hipg_bench.leaderboard import verify as verifying
     from hipg_bench.leaderboard.board import Board
@@ -148,16 +158,16 @@ def refresh(
     from hipg_bench.policies.bundle import agents
 
     salt = read_salt(board, salt_file) if salt_file else None
-    match = _match("all", "standard", episodes, threads)
+    evaluation = _evaluation("all", "standard", episodes, threads)
     for name in agents():
         with _telling() as progress:
             with opened(name) as source:
                 added = adding.add(
                     Board(board),
                     source,
-                    match,
+                    evaluation,
                     replace=True,
-                    film_tasks=_filmed(films, match),
+                    film_tasks=_filmed(films, evaluation),
                     progress=progress,
                 )
             found = (
@@ -176,10 +186,10 @@ def refresh(
 
 @salts.command()
 def new(
-    file: Annotated[Path, typer.Argument(help="Where to keep it, outside any repository.")],
+    file: Annotated[Path, typer.Argument(help="New file for the salt, outside any repository.")],
     board: BoardFolder = BOARD,
 ) -> None:
-    """Draw a salt, and publish its hash on the board."""
+    """Generate a salt and publish its hash on the board."""
     from hipg_bench.evaluation.seeds import SUITE
     from hipg_bench.leaderboard.salt import new_salt
 
@@ -190,10 +200,10 @@ def new(
 
 @salts.command()
 def reveal(
-    file: Annotated[Path, typer.Argument(help="The salt that the board is bound to.")],
+    file: Annotated[Path, typer.Argument(help="File with the salt whose hash the board has published.")],
     board: BoardFolder = BOARD,
 ) -> None:
-    """Publish the salt: everybody can play the hidden worlds again, and a new one can be drawn."""
+    """Publish the salt, so that everybody can reproduce the hidden worlds."""
     from hipg_bench.leaderboard.board import Board
     from hipg_bench.leaderboard.salt import private_folder, reveal_salt
 
@@ -205,12 +215,12 @@ def reveal(
         console.warn(f"missing or not as promised: {path}")
 
 
-def _match(splits: str, tasks: str, episodes: int, threads: int) -> Match:
+def _evaluation(splits: str, tasks: str, episodes: int, threads: int) -> BoardEvaluation:
     """What the options say is to be played."""
     from hipg_bench import registry
     from hipg_bench.errors import UnknownNameError, hint
     from hipg_bench.evaluation.splits import SPLITS
-    from hipg_bench.leaderboard.playing import SUITE, Match
+    from hipg_bench.leaderboard.playing import SUITE, BoardEvaluation
 
     chosen = SPLITS if splits == "all" else _names(splits)
     for split in chosen:
@@ -219,11 +229,11 @@ def _match(splits: str, tasks: str, episodes: int, threads: int) -> Match:
     names = registry.tagged(SUITE) if tasks == SUITE else _names(tasks)
     for task in names:
         registry.task_spec(task)
-    return Match(tuple(names), chosen, episodes, threads)
+    return BoardEvaluation(tuple(names), chosen, episodes, threads)
 
 
-def _filmed(films: str, match: Match) -> tuple[str, ...]:
-    return {"all": match.tasks, "none": ()}.get(films, _names(films))
+def _filmed(films: str, evaluation: BoardEvaluation) -> tuple[str, ...]:
+    return {"all": evaluation.tasks, "none": ()}.get(films, _names(films))
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from hipg_bench.policies.policy import Policy
 
 SeedOption = Annotated[int, typer.Option(min=0, help="Evaluation seed.")]
-EpisodeOption = Annotated[int, typer.Option(min=0, help="World of an evaluation with that seed.")]
+EpisodeOption = Annotated[
+    int, typer.Option(min=0, help="Index of the world in the evaluation with that seed.")
+]
 TrainSeedOption = Annotated[
-    int | None, typer.Option(min=0, help="Which of the agent's trainings, by default its first.")
+    int | None, typer.Option(min=0, help="Training seed of the agent's policy; by default the first one.")
 ]
 
 
@@ -32,13 +34,13 @@ def video(
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,
-    out: Annotated[Path | None, typer.Option(help="File, .mp4 or .gif.")] = None,
-    width: Annotated[int, typer.Option(min=64, help="Pixels.")] = 1280,
-    height: Annotated[int, typer.Option(min=64, help="Pixels.")] = 720,
+    out: Annotated[Path | None, typer.Option(help="Output file, .mp4 or .gif.")] = None,
+    width: Annotated[int, typer.Option(min=64, help="Width in pixels.")] = 1280,
+    height: Annotated[int, typer.Option(min=64, help="Height in pixels.")] = 720,
     fps: Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")] = 30,
 ) -> None:
-    """Play one episode and film it."""
-    from hipg_bench.evaluation.episodes import Plan
+    """Play one episode and record a video."""
+    from hipg_bench.evaluation.episodes import EvaluationJob
     from hipg_bench.policies.trained import find_agent
     from hipg_bench.rendering import film
 
@@ -46,11 +48,11 @@ def video(
     spec = task_for(who, task, num_agents, setting)
     policy = who.chosen_policy(spec, train_seed)
     path = out or Path("runs") / f"{spec.task}-{who.name}-{seed}-{episode}.mp4"
-    plan = Plan(seed=seed, episodes=episode + 1, threads=1)
+    job = EvaluationJob(seed=seed, episodes=episode + 1, threads=1)
     with console.progress() as bars:
         bar = bars.add_task(f"play {spec.task}", total=1.0)
-        row = plan.play(spec, policy, [episode], lambda done: bars.advance(bar, done))[0]
-        states = plan.record(spec, policy, row)
+        row = job.play(spec, policy, [episode], lambda done: bars.advance(bar, done))[0]
+        states = job.record(spec, policy, row)
         bar = bars.add_task("film", total=None)
         film.record(
             spec, states, path, agent=who.name, size=(width, height), fps=fps, end_reason=row["end_reason"],
@@ -67,9 +69,11 @@ def view(
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,
-    speed: Annotated[float, typer.Option(min=0.05, max=20.0, help="Times real time.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.05, max=20.0, help="Playback speed relative to real time.")
+    ] = 1.0,
 ) -> None:
-    """Watch an agent play in an interactive window, episode after episode."""
+    """Show an agent's episodes in an interactive window."""
     from hipg_bench import registry
     from hipg_bench.policies.trained import find_agent
     from hipg_bench.rendering import viewer

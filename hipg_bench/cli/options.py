@@ -46,11 +46,11 @@ TaskArgument = Annotated[
     str, typer.Argument(help="A task's name or a task file (.toml).", autocompletion=complete_task)
 ]
 NumAgentsOption = Annotated[
-    int | None, typer.Option(min=2, max=31, help="Another number of agents than the task has.")
+    int | None, typer.Option(min=2, max=31, help="Number of agents, if it differs from the task's.")
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Another number of the task, as name=value; may be repeated."),
+    typer.Option("--set", help="Change a number of the task, as name=value; may be repeated."),
 ]
 
 
@@ -77,7 +77,7 @@ def task_of(task: str, num_agents: int | None = None, changes: list[str] | None 
 def task_for(
     agent: Agent, task: str | None, num_agents: int | None = None, changes: list[str] | None = None
 ) -> TaskSpec:
-    """The same, by default the only task that the agent plays.
+    """As `task_of`; the default is the only task that the agent plays.
 
     Raises:
         SpecError: no task is given and the agent plays several, or none that is known.

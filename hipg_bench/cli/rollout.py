@@ -17,33 +17,33 @@ def rollout(
     ],
     task: TaskOption = None,
     agent: AgentOption = "mappo_minhealth",
-    episodes: Annotated[int, typer.Option(min=1, help="How many to play.")] = 64,
+    episodes: Annotated[int, typer.Option(min=1, help="Number of episodes.")] = 64,
     seed: Annotated[
         int,
         typer.Option(min=0, help="Seed of the first 64 worlds; scores are measured with seeds from 1000 on."),
     ] = 0,
     train_seed: Annotated[
-        int | None, typer.Option(min=0, help="Which of the agent's trainings, by default its first.")
+        int | None, typer.Option(min=0, help="Training seed of the agent's policy; by default the first one.")
     ] = None,
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
-    threads: Annotated[int, typer.Option(min=0, help="Physics threads, 0 for all cores.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="Physics threads; 0 uses all cores.")] = 0,
 ) -> None:
     """Play episodes and save every step: observations, actions, rewards, health, joint states."""
     import numpy as np
 
     from hipg_bench.evaluation import trajectories
-    from hipg_bench.evaluation.episodes import Plan
+    from hipg_bench.evaluation.episodes import EvaluationJob
     from hipg_bench.policies.trained import find_agent
 
     trajectories.check_target(out)
     who = find_agent(agent)
     spec = task_for(who, task, num_agents, setting)
     policy = who.chosen_policy(spec, train_seed)
-    plan = Plan(seed, episodes, threads=threads)
+    job = EvaluationJob(seed, episodes, threads=threads)
     with console.progress() as bars:
         bar = bars.add_task(f"play {spec.task}", total=episodes)
-        played = list(trajectories.trajectories(spec, policy, plan, lambda done: bars.advance(bar, done)))
+        played = list(trajectories.trajectories(spec, policy, job, lambda done: bars.advance(bar, done)))
     trajectories.write(out, spec, who.name, played)
     steps = sum(len(one.reward) for one in played)
     mean = float(np.mean([one.reward.sum() for one in played]))

@@ -16,25 +16,26 @@ if TYPE_CHECKING:
     from hipg_bench.submissions.findings import Finding
 
 app = typer.Typer(
-    help="Make, check and pack an agent for the leaderboard: docs/submit.md.", no_args_is_help=True
+    help="Create, check and pack an agent for the leaderboard (docs/submit.md).", no_args_is_help=True
 )
 
 Folder = Annotated[Path, typer.Argument(help="The agent's folder, with agent.toml.")]
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Run its code without a sandbox; only for code of your own.")
+    bool, typer.Option("--trust", help="Run the agent's code without a sandbox; only for your own code.")
 ]
 _STYLES = {"error": "bold red", "advice": "yellow", "fine": "green"}
 
 
 @app.command()
 def init(
-    name: Annotated[Path, typer.Argument(help="The agent's name, and its new folder.")],
+    name: Annotated[Path, typer.Argument(help="New folder; its name is the agent's name.")],
     tier: Annotated[
-        int, typer.Option(min=0, max=2, help="0 declared network, 1 ONNX, 2 Python in a sandbox.")
+        int,
+        typer.Option(min=0, max=2, help="Kind of agent: 0 declared network, 1 ONNX, 2 Python in a sandbox."),
     ] = 0,
-    authors: Annotated[str, typer.Option(help="Whom to thank.")] = "",
-    license: Annotated[str, typer.Option(help="Such as MIT or Apache-2.0.")] = "",
-    summary: Annotated[str, typer.Option(help="One sentence.")] = "",
+    authors: Annotated[str, typer.Option(help="Authors of the agent.")] = "",
+    license: Annotated[str, typer.Option(help="Licence, such as MIT or Apache-2.0.")] = "",
+    summary: Annotated[str, typer.Option(help="Summary of the agent in one sentence.")] = "",
     from_run: Annotated[
         list[Path] | None,
         typer.Option(
@@ -81,9 +82,9 @@ def _next_steps(
 def check(
     folder: Folder,
     trust: Trust = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Say what would keep an agent from the board, and what to do about it; exit code 1 if anything would."""
+    """Check whether an agent can be submitted and print how to fix errors. Exits with 1 on errors."""
     from hipg_bench.submissions.check import check as look
 
     found: list[Finding] = []
@@ -108,12 +109,14 @@ def pack(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", help="The zip; by default <name>.zip here, or beside the folder if you are in it."
+            "--out",
+            "-o",
+            help="Output zip; by default <name>.zip here, or beside the folder if it is the working folder.",
         ),
     ] = None,
     trust: Trust = False,
 ) -> None:
-    """Check an agent and pack it; nothing is written if anything would keep it from the board."""
+    """Check an agent and pack it into a zip. Nothing is written if the check finds errors."""
     from hipg_bench.submissions.archive import pack as write
     from hipg_bench.submissions.check import check as look
 

@@ -8,12 +8,12 @@ import typer
 
 from hipg_bench.cli import console
 
-app = typer.Typer(help="The suite version that scores refer to: is the tree what was frozen?")
+app = typer.Typer(help="Check that this checkout matches the frozen benchmark version.")
 
 
 @app.command()
 def check(as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False) -> None:
-    """Compare the tree with the frozen suite version; exit code 1 where it differs."""
+    """Compare this checkout with the frozen benchmark version. Exits with 1 if it differs."""
     from hipg_bench.evaluation import protocol
 
     differences = protocol.differences()
@@ -32,7 +32,7 @@ def check(as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] 
 
 @app.command()
 def freeze() -> None:
-    """Write the suite file anew, after a change that leaves every episode as it was."""
+    """Rewrite the frozen version after a change that leaves all episodes unchanged."""
     from hipg_bench.evaluation import protocol
 
     console.say(str(protocol.freeze()))

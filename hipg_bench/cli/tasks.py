@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from hipg_bench.layout import Layout
     from hipg_bench.spec import TaskSpec
 
-app = typer.Typer(help="List the tasks; show the numbers and vectors of one.", no_args_is_help=False)
+app = typer.Typer(help="List the tasks, or show the numbers and vectors of one.", no_args_is_help=False)
 
-AsJson = Annotated[bool, typer.Option("--json", help="For scripts.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
 
 @app.callback(invoke_without_command=True)
 def tasks(context: typer.Context, as_json: AsJson = False) -> None:
-    """List the tasks; show the numbers and vectors of one."""
+    """List the tasks, or show the numbers and vectors of one."""
     if context.invoked_subcommand is not None:
         return
     from hipg_bench import registry
@@ -49,7 +49,7 @@ def show(
     setting: SetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print a task's numbers, and its observation, action and joint-state tables."""
+    """Show a task's numbers and what its observation, action and joint-state vectors contain."""
     from hipg_bench import registry
 
     spec = task_of(task, num_agents, setting)
@@ -87,7 +87,7 @@ def copy(
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
 ) -> None:
-    """Write a task file of your own, with a task's numbers, some of them changed."""
+    """Copy a task into a new task file, with changed numbers if wanted."""
     from hipg_bench import registry
     from hipg_bench.paths import write_text
     from hipg_bench.spec import TaskSpec, parse, to_toml

@@ -40,18 +40,16 @@ def train(
             "(also called ippo); or maddpg, or qmix.",
         ),
     ] = "min_health",
-    preset: Annotated[
-        str, typer.Option(help="Settings to start from: recommended or paper.")
-    ] = "recommended",
-    seed: Annotated[int, typer.Option(min=0, max=999, help="Fixes all chance of the run.")] = 0,
+    preset: Annotated[str, typer.Option(help="Preset of settings: recommended or paper.")] = "recommended",
+    seed: Annotated[int, typer.Option(min=0, max=999, help="Random seed.")] = 0,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Environment steps, by default the preset's.")
+        int | None, typer.Option(min=1, help="Environment steps; by default the preset's.")
     ] = None,
     setting: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
-            help="Another setting of the training or number of the task, as name=value; may be repeated.",
+            help="Change a setting of the training or a number of the task, as name=value; may be repeated.",
         ),
     ] = None,
     out: Annotated[
@@ -62,20 +60,24 @@ def train(
         ),
     ] = None,
     threads: Annotated[
-        int, typer.Option(min=1, help="Of physics and of torch. One run per core is faster.")
+        int,
+        typer.Option(
+            min=1, help="Threads of physics and PyTorch. Several runs with one thread each are faster."
+        ),
     ] = 1,
     sweep: Annotated[
-        Path | None, typer.Option(help="A file that lists many runs, instead of --task.")
+        Path | None, typer.Option(help="Sweep file that lists many runs, instead of --task.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Runs of a sweep at a time, by default one per core.")
+        int | None,
+        typer.Option(min=1, help="Runs of a sweep trained at the same time; by default one per core."),
     ] = None,
     track: Annotated[
         list[str] | None, typer.Option(help="Show the run in wandb or trackio too; may be repeated.")
     ] = None,
-    status: Annotated[bool, typer.Option("--status", help="Only say how far a sweep is.")] = False,
+    status: Annotated[bool, typer.Option("--status", help="Show the sweep's progress and exit.")] = False,
 ) -> None:
-    """Train a team, or the many of a sweep; what was killed goes on with the same command."""
+    """Train one run or a sweep. Run the same command again to resume."""
     if (task is None) == (sweep is None) or (status and sweep is None):
         raise SpecError("train takes either --task or --sweep; --status belongs to the latter")
     from hipg_bench.processes import usable_cores

@@ -2,7 +2,7 @@
 
 A run with seed k of an algorithm on a task comes to lie in ``<agents>/<bundle>/<task>/``:
 
-    seed<k>.safetensors          the last policy, whatever the trials said of earlier ones
+    seed<k>.safetensors          the last policy, not the one that periodic evaluations found best
     seed<k>.json                 the run's record, and its score by the standard protocol
     seed<k>.curve.csv            raw rows of the learning curve, at most `MOST_ROWS`
     seed<k>.learner.safetensors  the networks an audit needs; of seed 0 only, to bound the size
@@ -25,7 +25,7 @@ import numpy as np
 
 from hipg_bench.comparison.cards import card_text, readme
 from hipg_bench.errors import BundleError
-from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.episodes import EvaluationJob, Row
 from hipg_bench.evaluation.statistics import mean_ci95
 from hipg_bench.learning.sweep import Run
 from hipg_bench.paths import replacing, write_text
@@ -33,7 +33,7 @@ from hipg_bench.policies.network import load_network
 from hipg_bench.registry import task_spec
 
 MOST_ROWS = 300
-"""Of a curve; all rows with a trial's score come first."""
+"""Of a curve; all rows with a periodic evaluation come first."""
 BUNDLES = {
     "min_health": "mappo_minhealth",
     "central": "mappo_central",
@@ -67,15 +67,15 @@ def bundle_name(algorithm: str) -> str:
 
 
 def collect(
-    runs: Sequence[Run], agents: Path, *, replace: bool = False, plan: Plan | None = None
+    runs: Sequence[Run], agents: Path, *, replace: bool = False, job: EvaluationJob | None = None
 ) -> Iterator[Collected]:
     """Make artefacts of what is finished, one run after another; the cards are written at the end.
 
     Args:
         runs: of a sweep.
         agents: the folder of bundles.
-        replace: another policy of the same seed gives way.
-        plan: which worlds the score is of, by default the standard protocol's.
+        replace: overwrite another policy of the same seed.
+        job: which worlds the score is of, by default the standard protocol's.
 
     Yields:
         What became of each run.
@@ -85,7 +85,7 @@ def collect(
         folder = agents / bundle_name(run.algorithm)
         state = _state(run, folder, replace)
         if state == "new":
-            _add(run, folder, plan or Plan())
+            _add(run, folder, job or EvaluationJob())
             touched.add(folder)
         yield Collected(run, folder.name, state)
     for folder in sorted(touched):
@@ -129,7 +129,7 @@ def _place(run: Run, folder: Path) -> Path:
     return folder / run.settings.task / f"seed{run.settings.seed}"
 
 
-def _add(run: Run, folder: Path, plan: Plan) -> None:
+def _add(run: Run, folder: Path, job: EvaluationJob) -> None:
     """Write a run's files; the policy goes last: where it is, all the others are."""
     place, settings = _place(run, folder), run.settings
     policy, record = run.out / "policy.safetensors", run.record
@@ -137,7 +137,7 @@ def _add(run: Run, folder: Path, plan: Plan) -> None:
         raise BundleError(f"{run.out} holds no finished run")
     if not (folder / "agent.toml").exists():
         write_text(folder / "agent.toml", card_text(run.algorithm, folder.name))
-    rows = plan.play_all(task_spec(settings.task), load_network(policy))
+    rows = job.play_all(task_spec(settings.task), load_network(policy))
     write_text(
         place.with_suffix(".json"),
         json.dumps({**record, "train_seed": settings.seed, "result": result(settings.task, rows)}, indent=2)

@@ -49,7 +49,8 @@ def readme(folder: Path) -> str:
 _ABOUT = """\
 Written by `hipg-bench collect` from the records beside the weights. Scores are of the standard protocol: 0
 as random actions, 1 as the task's reference, in brackets the 95 % interval over the episodes, which speaks of
-their luck, not of the training's. The last policy of a run counts, whatever its trials said of earlier ones.
+the episodes' randomness, not of the training's. The last policy of a run counts, not the one that periodic
+evaluations found best.
 Curves: `<task>/seed<k>.curve.csv`.
 """
 

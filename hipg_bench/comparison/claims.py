@@ -6,7 +6,7 @@ training. It **holds** if the 95 % interval of P(improvement) lies above 1/2 and
 difference** if the 90 % interval lies within 1/2 +- 0.1, the equivalence test of two one-sided tests at 0.05,
 and each task has five runs of both sides, since the interval of fewer says nothing; else it is **undecided**.
 Tasks where one side has no run are left out, and so are runs that began with another run's policy. There is
-no correction for the number of claims: about one in twenty would pass by luck.
+no correction for the number of claims: about one in twenty would pass by chance.
 
 Pooling over tasks hides an algorithm that is better on one and worse on another, so each task has a verdict
 of its own, by the same rule, with Holm's correction (1979) for the number of tasks in the claim.

@@ -185,7 +185,11 @@ def _algorithms_of(family: str, tasks: Sequence[str], runs: Sequence[Trace]) -> 
 
 def _source(runs: Sequence[Trace]) -> str:
     """What the scores are of."""
-    tried = {run.tried for run in runs}
-    if tried == {True}:
-        return "trials without exploration"
-    return "training episodes, with exploration" if tried == {False} else "trials, or training episodes"
+    evaluated = {run.evaluated for run in runs}
+    if evaluated == {True}:
+        return "periodic evaluations without exploration"
+    return (
+        "training episodes, with exploration"
+        if evaluated == {False}
+        else "periodic evaluations, or training episodes"
+    )

@@ -31,7 +31,8 @@ class Trace:
         seed: of the training.
         steps: (K,) environment steps, rising.
         score: (K,) there, 0 as random actions and 1 as the reference.
-        tried: scores are of trials without exploration; else of the training's own episodes.
+        evaluated: scores are of periodic evaluations without exploration; else of the training's own
+            episodes.
         warm: it began with another run's policy.
         final: score of the last policy by the standard protocol; else the mean of the last tenth.
     """
@@ -41,7 +42,7 @@ class Trace:
     seed: int
     steps: Float[np.ndarray, "K"]
     score: Float[np.ndarray, "K"]
-    tried: bool
+    evaluated: bool
     warm: bool
     final: float
 
@@ -67,8 +68,8 @@ def traces(agents: Path) -> list[Trace]:
                 curves.setdefault(spec.task, []).append((path, algorithm, spec, int(seed[1])))
     found: list[Trace | None] = []
     for ones in curves.values():
-        evaluated = [_read(*one, tried=True) for one in ones]
-        trained = [_read(*one, tried=False) for one in ones]
+        evaluated = [_read(*one, evaluated=True) for one in ones]
+        trained = [_read(*one, evaluated=False) for one in ones]
         chosen = trained if None in evaluated and any(trained) else evaluated
         found += [one or other for one, other in zip(chosen, evaluated, strict=True)]
     runs = [run for run in found if run is not None]
@@ -93,7 +94,7 @@ def _algorithm(bundle: str) -> str | None:
     return None
 
 
-def _read(path: Path, algorithm: str, spec: TaskSpec, seed: int, *, tried: bool) -> Trace | None:
+def _read(path: Path, algorithm: str, spec: TaskSpec, seed: int, *, evaluated: bool) -> Trace | None:
     """The run of a curve on today's anchors, if what is asked for was measured.
 
     Args:
@@ -101,17 +102,17 @@ def _read(path: Path, algorithm: str, spec: TaskSpec, seed: int, *, tried: bool)
         algorithm: whose.
         spec: the task.
         seed: of the training.
-        tried: the periodic evaluations' returns; else those of the training's own episodes.
+        evaluated: the periodic evaluations' returns; else those of the training's own episodes.
     """
     record = read_json(path.with_name(f"seed{seed}.json"))
-    column = "eval_return" if tried else "return"
-    if not tried and record.get("settings", {}).get("weights"):
+    column = "eval_return" if evaluated else "return"
+    if not evaluated and record.get("settings", {}).get("weights"):
         return None  # training paid for other things
     with path.open(encoding="utf-8", newline="") as file:
         points = [
             (float(row["steps"]), float(row[column])) for row in csv.DictReader(file) if row.get(column)
         ]
-    if len(points) < 1 + tried:
+    if len(points) < 1 + evaluated:
         return None
     steps, returns = np.array(points).T
     score = np.array([spec.score(value) for value in returns])
@@ -119,4 +120,4 @@ def _read(path: Path, algorithm: str, spec: TaskSpec, seed: int, *, tried: bool)
     last = score[steps > (1 - _END) * steps[-1]].mean()
     warm = bool(record.get("settings", {}).get("initial_policy"))
     reached = float(last if final is None else spec.score(final))
-    return Trace(algorithm, spec.task, seed, steps, score, tried, warm, reached)
+    return Trace(algorithm, spec.task, seed, steps, score, evaluated, warm, reached)

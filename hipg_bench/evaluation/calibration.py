@@ -1,7 +1,7 @@
 """Measuring what fixes a task's score, and what shows that the task is about health.
 
 The measured numbers are frozen in the task file: anchors (random actions at score 0, the reference
-at 1), the hazard leverage, and the scores of probes, policies without eyes that must score little.
+at 1), the hazard sensitivity, and the scores of open-loop baselines, which must be low.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from hipg_bench import registry
 from hipg_bench.errors import SpecError
 from hipg_bench.evaluation import splits
-from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.episodes import EvaluationJob, Row
 from hipg_bench.evaluation.statistics import mean_ci95
 from hipg_bench.paths import write_text
 from hipg_bench.policies.policy import Policy
@@ -68,7 +68,7 @@ def calibrate(spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Prog
     Raises:
         UnknownNameError: its family has neither a scripted expert nor a stated reference.
     """
-    lab = _Lab(spec, Plan(_SEED, episodes, threads=threads), progress)
+    lab = _Lab(spec, EvaluationJob(_SEED, episodes, threads=threads), progress)
     size = registry.family_of(spec).layout.action.size
     random = lab.play("random", Random(size))
     reference, reference_is = _stated(spec) or (
@@ -88,12 +88,12 @@ def calibrate(spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Prog
         harmless = spec.override(**{_RISK: 0.0})
         # with nothing to fear, the expert is the one that fears nothing
         safe = lab.play("hazard off", Scripted(harmless, blind=True), harmless)
-        blind = lab.play("blind", Scripted(spec, blind=True))
-        scores |= {"hazard off": _score(scale, safe), "blind": _score(scale, blind)}
-        facts["blind_deaths"] = float(np.mean([row["deaths"] for row in blind])) / spec.num_agents
-        facts["score_blind"] = scores["blind"][0]
+        blind = lab.play("hazard-unaware", Scripted(spec, blind=True))
+        scores |= {"hazard off": _score(scale, safe), "hazard-unaware": _score(scale, blind)}
+        facts["hazard_unaware_deaths"] = float(np.mean([row["deaths"] for row in blind])) / spec.num_agents
+        facts["score_hazard_unaware"] = scores["hazard-unaware"][0]
         facts["score_hazard_off"] = scores["hazard off"][0]
-        facts["hazard_leverage"] = scores["hazard off"][0] - scores["blind"][0]
+        facts["hazard_sensitivity"] = scores["hazard off"][0] - scores["hazard-unaware"][0]
     rounded = {name: round(value, 4) for name, value in facts.items()}
     return Calibration(scale.model_copy(update={"calibration": rounded}), scores)
 
@@ -101,21 +101,21 @@ def calibrate(spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Prog
 def anchors_in(split: str, spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Progress) -> Anchors:
     """Measure a task's anchors under the rules of a split.
 
-    The reference knows what the split changed: it is made for each variant anew.
+    The reference knows what the split changed: it is made again for each variant.
 
     Raises:
         UnknownNameError: no such split, or it has no rules for the task's family.
     """
-    plan = Plan(_SEED, episodes, threads=threads, split=split)
+    job = EvaluationJob(_SEED, episodes, threads=threads, split=split)
     size = registry.family_of(spec).layout.action.size
-    random = plan.play_all(spec, Random(size), lambda done: progress("random", done))
+    random = job.play_all(spec, Random(size), lambda done: progress("random", done))
     stated = _stated(spec)
     if stated:
         return Anchors(random=_anchor(random), reference=stated[0], reference_is=stated[1])
     rows: list[Row] = []
-    for worlds in plan.batches():
-        expert = Scripted(plan.spec(spec, worlds[0]))
-        rows += plan.play(spec, expert, worlds, lambda done: progress("scripted", done))
+    for worlds in job.batches():
+        expert = Scripted(job.spec(spec, worlds[0]))
+        rows += job.play(spec, expert, worlds, lambda done: progress("scripted", done))
     return Anchors(random=_anchor(random), reference=_anchor(rows))
 
 
@@ -157,23 +157,23 @@ class _Lab:
     """Where a task is measured."""
 
     spec: TaskSpec
-    plan: Plan
+    job: EvaluationJob
     progress: Progress
 
     def play(self, name: str, policy: Policy, spec: TaskSpec | None = None) -> list[Row]:
-        return self.plan.play_all(spec or self.spec, policy, lambda done: self.progress(name, done))
+        return self.job.play_all(spec or self.spec, policy, lambda done: self.progress(name, done))
 
     def best(self, name: str, variant: Callable[[int], Policy]) -> list[Row]:
         """Episodes of the best of some variants of a probe, chosen on other worlds."""
-        choice = Plan(_CHOICE_SEED, _CHOICE_EPISODES, threads=self.plan.threads)
+        choice = EvaluationJob(_CHOICE_SEED, _CHOICE_EPISODES, threads=self.job.threads)
         # choosing counts as half of the work
-        share = self.plan.episodes / (2 * _CHOICE_EPISODES * _VARIANTS)
+        share = self.job.episodes / (2 * _CHOICE_EPISODES * _VARIANTS)
         means = [
             _mean(choice.play_all(self.spec, variant(k), lambda done: self.progress(name, share * done)))
             for k in range(_VARIANTS)
         ]
         chosen = variant(int(np.argmax(means)))
-        return self.plan.play_all(self.spec, chosen, lambda done: self.progress(name, done / 2))
+        return self.job.play_all(self.spec, chosen, lambda done: self.progress(name, done / 2))
 
 
 def _stated(spec: TaskSpec) -> tuple[Anchor, str] | None:

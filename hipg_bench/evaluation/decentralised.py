@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench.errors import AgentFailure
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.failures import close
 from hipg_bench.policies.policy import Policy
 from hipg_bench.spec import TaskSpec
@@ -118,7 +118,7 @@ _REPLAYS = 4
 """Times that a batch is replayed, each time with another agent of every world."""
 
 
-def verify(spec: TaskSpec, policy: Policy, plan: Plan, worlds: Sequence[int]) -> Verdict:
+def verify(spec: TaskSpec, policy: Policy, job: EvaluationJob, worlds: Sequence[int]) -> Verdict:
     """Play a batch of worlds, then replay it with other team-mates' observations, and compare.
 
     What an agent does rarely may not occur: a verdict of ``decentralised`` is no proof.
@@ -126,11 +126,11 @@ def verify(spec: TaskSpec, policy: Policy, plan: Plan, worlds: Sequence[int]) ->
     Args:
         spec: the task.
         policy: acts on observations; all agents at once.
-        plan: how worlds are made.
+        job: how worlds are made.
         worlds: which, two or more of one evaluation seed; as many as in a scored batch.
     """
     recorder = _Recorder(policy)
-    plan.play(spec, recorder, list(worlds))
+    job.play(spec, recorder, list(worlds))
     chance = np.random.default_rng(secrets.randbits(64))
     compared = 0
     found: dict[tuple[int, int], Difference] = {}

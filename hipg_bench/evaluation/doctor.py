@@ -1,4 +1,4 @@
-"""What is wrong with this machine or installation, found by trying; and the line that mends it."""
+"""What is wrong with this machine or installation, found by trying; and the line that fixes it."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Finding(NamedTuple):
         name: what was looked at.
         level: how bad it is.
         text: what was found.
-        mend: the line to run, empty where nothing is wrong.
+        fix: the line to run, empty where nothing is wrong.
     """
 
     name: str
     level: Level
     text: str
-    mend: str = ""
+    fix: str = ""
 
 
 _PACKAGE = "hipg-bench"
@@ -116,17 +116,17 @@ def _packages() -> Iterator[Finding]:
 
 def _package(requirement: Requirement) -> Finding:
     name = requirement.name
-    mend = f"{sys.executable} -m pip install '{name}{requirement.specifier}'"
+    fix = f"{sys.executable} -m pip install '{name}{requirement.specifier}'"
     try:
         version = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, "broken", "missing", mend)
+        return Finding(name, "broken", "missing", fix)
     if requirement.specifier.contains(version, prereleases=True):
         return Finding(name, "ok", version)
     why = f"{version}, but {requirement.specifier} is needed"
     if name == "mujoco" and Version(version) >= Version("4"):
         why += ": dm-control 1.0.50 does not work with mujoco 4 (flex_vertedge)"
-    return Finding(name, "broken", why, mend)
+    return Finding(name, "broken", why, fix)
 
 
 def _gl_variables() -> Iterator[Finding]:
@@ -156,13 +156,13 @@ def _graphics() -> Iterator[Finding]:
             yield Finding(name, "ok", f"a frame in {probe.seconds:.1f} s, {probe.renderer}")
         else:
             # one backend is enough
-            yield Finding(name, "note" if usable else "warning", probe.error, gl.MEND)
+            yield Finding(name, "note" if usable else "warning", probe.error, gl.INSTALL_COMMAND)
     if not usable:
-        yield Finding("films", "warning", "no OpenGL works: scores come without films", gl.MEND)
+        yield Finding("films", "warning", "no OpenGL works: scores come without films", gl.INSTALL_COMMAND)
 
 
 def _encoder() -> Iterator[Finding]:
-    mend = f"{sys.executable} -m pip install --force-reinstall imageio-ffmpeg"
+    fix = f"{sys.executable} -m pip install --force-reinstall imageio-ffmpeg"
     try:
         import imageio_ffmpeg
 
@@ -174,14 +174,14 @@ def _encoder() -> Iterator[Finding]:
             [program, "-hide_banner", "-encoders"], capture_output=True, text=True, timeout=30, check=True
         ).stdout
     except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
-        yield Finding("ffmpeg", "warning", str(error), mend)
+        yield Finding("ffmpeg", "warning", str(error), fix)
         return
     version = " ".join(said.split()[:3])
     if "libx264" in listed:
         yield Finding("ffmpeg", "ok", f"{version}, with libx264")
     else:
         yield Finding(
-            "ffmpeg", "warning", f"{version} cannot write H.264", f"unset IMAGEIO_FFMPEG_EXE; {mend}"
+            "ffmpeg", "warning", f"{version} cannot write H.264", f"unset IMAGEIO_FFMPEG_EXE; {fix}"
         )
 
 
@@ -234,11 +234,11 @@ def _data() -> Iterator[Finding]:
 
 def _sandbox() -> Iterator[Finding]:
     """What each way to lock agents of others in refuses, by trying."""
-    trials = choice.trials()
-    works = any(trial.works for trial in trials.values())
-    for name, trial in trials.items():
-        text = f"{trial} ({trial.seconds:.1f} s)"
-        if trial.works:
+    results = choice.probe_all()
+    works = any(result.works for result in results.values())
+    for name, result in results.items():
+        text = f"{result} ({result.seconds:.1f} s)"
+        if result.works:
             yield Finding(f"sandbox {name}", "ok", text)
         else:
             level: Level = "note" if works else "warning"

@@ -47,7 +47,7 @@ def silent(episodes: float) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class EvaluationJob:
     """Which worlds are played, and how many at a time.
 
     Attributes:
@@ -57,8 +57,8 @@ class Plan:
         threads: physics threads, 0 for all cores; no result depends on it.
         split: what the team meets beside the task; see `hipg_bench.evaluation.splits`.
         salt: hidden worlds follow from it; None plays the public ones.
-        luck: in hidden worlds, what the agent is told as its own seed follows from this too, so that an
-            agent cannot recognise a world from an earlier evaluation by it.
+        agent_seed_key: in hidden worlds, what the agent is told as its own seed follows from this too, so
+            that an agent cannot recognise a world from an earlier evaluation by it.
     """
 
     seed: int = FIRST_SEED
@@ -67,7 +67,7 @@ class Plan:
     threads: int = 0
     split: str = splits.STANDARD
     salt: bytes | None = dataclasses.field(default=None, repr=False)
-    luck: str = ""
+    agent_seed_key: str = ""
 
     def eval_seed(self, task: str, world: int) -> int:
         """The environment's seed in a world."""
@@ -78,7 +78,7 @@ class Plan:
         """The seed that the policy is told for its own chance."""
         if self.salt is None:
             return self.eval_seed(task, world)
-        return hidden_seed(self.salt, f"{self.split}|{self.luck}", task, world // WORLDS_PER_SEED)
+        return hidden_seed(self.salt, f"{self.split}|{self.agent_seed_key}", task, world // WORLDS_PER_SEED)
 
     def told_seed(self, task: str, world: int) -> int | None:
         """The same as a row tells it: nobody may learn a hidden one."""
@@ -86,7 +86,7 @@ class Plan:
 
     def spec(self, spec: TaskSpec, world: int) -> TaskSpec:
         """The task as it is in a world of the split."""
-        return splits.setting(self.split, spec).spec(spec, world // WORLDS_PER_SEED)
+        return splits.split_config(self.split, spec).spec(spec, world // WORLDS_PER_SEED)
 
     def episode_id(self, world: int) -> int:
         """Which of the seed's episodes a world is."""
@@ -173,7 +173,7 @@ class Plan:
         self, spec: TaskSpec, policy: Policy, worlds: Sequence[int], threads: int
     ) -> tuple[Worlds, Watched]:
         """Build worlds of one block, and watch the policy that is to play them."""
-        place = splits.setting(self.split, spec)
+        place = splits.split_config(self.split, spec)
         ids = np.array([self.episode_id(world) for world in worlds])
         seed = self.eval_seed(spec.task, worlds[0])
         told = self.agent_seed(spec.task, worlds[0])
@@ -226,7 +226,7 @@ class Plan:
             "world": world,
             "eval_seed": self.told_seed(spec.task, world),
             "episode_id": self.episode_id(world),
-            "variant": splits.setting(self.split, spec).variant(block),
+            "variant": splits.split_config(self.split, spec).variant(block),
         }
 
     def _not_played(self, spec: TaskSpec, world: int) -> Row:

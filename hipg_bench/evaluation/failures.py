@@ -29,7 +29,7 @@ _SHARE = 20
 class Closable(Protocol):
     """A policy that holds something between calls, such as a child process.
 
-    After ``close`` it may be used again: ``initial_state`` starts anew.
+    After ``close`` it may be used again: ``initial_state`` starts again.
     """
 
     def close(self) -> None:

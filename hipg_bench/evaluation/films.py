@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hipg_bench.errors import HipgError, RenderError
-from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.episodes import EvaluationJob, Row
 from hipg_bench.evaluation.failures import OK
 from hipg_bench.paths import replacing
 from hipg_bench.policies.bundle import Agent
@@ -56,7 +56,7 @@ def choose_all(
     agent: Agent,
     specs: Sequence[TaskSpec],
     rows: Mapping[str, Sequence[Row]],
-    plan: Plan,
+    job: EvaluationJob,
     count: int,
     out: Path,
 ) -> tuple[list[Film], list[str]]:
@@ -69,14 +69,14 @@ def choose_all(
     trouble: list[str] = []
     for spec in specs:
         try:
-            chosen += choose(agent, spec, rows[spec.task], plan, count, out)
+            chosen += choose(agent, spec, rows[spec.task], job, count, out)
         except HipgError as error:
             trouble.append(str(error))
     return chosen, trouble
 
 
 def choose(
-    agent: Agent, spec: TaskSpec, rows: Sequence[Row], plan: Plan, count: int, out: Path
+    agent: Agent, spec: TaskSpec, rows: Sequence[Row], job: EvaluationJob, count: int, out: Path
 ) -> list[Film]:
     """Pick the median episode of the first training seed, then others from worst to best; save the states.
 
@@ -101,7 +101,7 @@ def choose(
         what = "the median episode" if median else f"quantile {quantile:.2f}"
         chosen.append(
             Film(
-                spec=plan.spec(spec, row["world"]),
+                spec=job.spec(spec, row["world"]),
                 agent=agent.name,
                 end_reason=row["end_reason"],
                 title=f"{what}: return {row['return']:.1f}, {row['deaths']} dead",
@@ -111,7 +111,7 @@ def choose(
         )
         if not _is_of(chosen[-1].saved, row):
             chosen[-1].video.unlink(missing_ok=True)
-            _save(agent, spec, row, plan, chosen[-1].saved)
+            _save(agent, spec, row, job, chosen[-1].saved)
     return chosen
 
 
@@ -166,14 +166,14 @@ def _is_of(saved: Path, row: Row) -> bool:
         with np.load(saved, allow_pickle=False) as file:
             return (int(file["train_seed"]), int(file["world"])) == (row["train_seed"], row["world"])
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-        return False  # damaged; it is written anew
+        return False  # damaged; it is written again
 
 
-def _save(agent: Agent, spec: TaskSpec, row: Row, plan: Plan, path: Path) -> None:
+def _save(agent: Agent, spec: TaskSpec, row: Row, job: EvaluationJob, path: Path) -> None:
     """Keep an episode's state rows, and what is needed to read them."""
-    rows = plan.record(spec, agent.policy(spec, row["train_seed"]), row)
+    rows = job.record(spec, agent.policy(spec, row["train_seed"]), row)
     with replacing(path) as temporary:
         np.savez_compressed(
-            temporary, rows=rows, spec=plan.spec(spec, row["world"]).model_dump_json(), agent=agent.name,
+            temporary, rows=rows, spec=job.spec(spec, row["world"]).model_dump_json(), agent=agent.name,
             train_seed=row["train_seed"], world=row["world"],
         )  # fmt: skip

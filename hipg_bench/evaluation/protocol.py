@@ -3,7 +3,7 @@
 ``tasks/suites/<suite>.toml`` holds the tasks with their fingerprints and anchors in every split, the seeds,
 the failure rule, the range of engine versions, and a hash of every file that decides how an episode goes.
 Scores are comparable where these are the same. A change that is meant makes a new suite version; one that
-changes no behaviour (the golden episodes say so) is frozen anew under the same.
+changes no behaviour (the golden episodes say so) is frozen again under the same.
 """
 
 from __future__ import annotations

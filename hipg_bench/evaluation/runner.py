@@ -24,7 +24,7 @@ from hipg_bench import registry
 from hipg_bench.documents import read_json
 from hipg_bench.errors import BundleError, ResumeError, SpecError, UnknownNameError
 from hipg_bench.evaluation import films, protocol, report, splits
-from hipg_bench.evaluation.episodes import Plan, Row, versions
+from hipg_bench.evaluation.episodes import EvaluationJob, Row, versions
 from hipg_bench.evaluation.failures import NOT_PLAYED, close
 from hipg_bench.evaluation.latency import Stopwatch
 from hipg_bench.evaluation.ranking import kind_of
@@ -82,7 +82,7 @@ def playable(
             skipped[spec.task] = f"no {'weights' if agent.card.kind == 'network' else 'policy'} for this task"
             continue
         try:
-            splits.setting(split, spec).background_policy(spec)
+            splits.split_config(split, spec).background_policy(spec)
             agent.check_distinct(spec.task)
             for train_seed in found:
                 close(agent.policy(spec, train_seed))
@@ -101,7 +101,7 @@ def evaluate(
     agent: Agent,
     suite: Suite,
     out: Path,
-    plan: Plan,
+    job: EvaluationJob,
     *,
     films_per_task: int = 0,
     progress: Progress = quiet,
@@ -114,7 +114,7 @@ def evaluate(
         agent: who plays.
         suite: what.
         out: folder, new or of the same evaluation interrupted earlier.
-        plan: which worlds.
+        job: which worlds.
         films_per_task: how many episodes are filmed; the first is the median one.
         progress: told how far it is.
         played_task: told the entry of ``tasks`` in ``results.json`` as soon as a task is played.
@@ -129,10 +129,10 @@ def evaluate(
         ResumeError: ``out`` belongs to another evaluation or is used by another process, holds files of
             somebody's that would be overwritten, or is damaged.
     """
-    seeds, skipped = playable(agent, suite, plan.split)
-    specs = [splits.with_anchors(plan.split, spec) for spec in suite.specs]
-    worlds = {"seed": plan.seed} if plan.salt is None else {"commitment": commitment(plan.salt)}
-    run = {"agent": agent.name, "split": plan.split, **worlds, "versions": versions()}
+    seeds, skipped = playable(agent, suite, job.split)
+    specs = [splits.with_anchors(job.split, spec) for spec in suite.specs]
+    worlds = {"seed": job.seed} if job.salt is None else {"commitment": commitment(job.salt)}
+    run = {"agent": agent.name, "split": job.split, **worlds, "versions": versions()}
     with _alone_in(out, run):
         seconds: dict[str, float] = {}
         watches: dict[str, Stopwatch] = {}
@@ -141,14 +141,14 @@ def evaluate(
             if spec.task in seeds:
                 watches[spec.task] = watch = Stopwatch()
                 with _timed(seconds, spec.task):
-                    rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, plan, watch, progress)
+                    rows[spec.task] = _play_task(agent, spec, seeds[spec.task], out, job, watch, progress)
                 played_task(summarise(spec, rows[spec.task]))
         played = [spec for spec in specs if spec.task in rows]
         own = [spec for spec in played if spec.task not in registry.tasks()]
         results: dict[str, Any] = {
             "schema": SCHEMA,
             "suite": suite.name,
-            "split": plan.split,
+            "split": job.split,
             "protocol": protocol.identity(),
             "agent": agent.name,
             "kind": kind_of(agent.card.kind == "builtin", [len(found) for found in seeds.values()]),
@@ -156,7 +156,7 @@ def evaluate(
             "seed": None,
             "commitment": None,
             **worlds,
-            "episodes_per_policy": plan.episodes,
+            "episodes_per_policy": job.episodes,
             "versions": versions(),
             "aggregate": aggregate([(spec, rows.get(spec.task, [])) for spec in specs]),
             "tasks": [summarise(spec, rows[spec.task]) for spec in played],
@@ -181,7 +181,7 @@ def evaluate(
         if films_per_task:
             try:
                 with _timed(seconds, "films"):
-                    _film(agent, played, rows, plan, films_per_task, out, results, progress)
+                    _film(agent, played, rows, job, films_per_task, out, results, progress)
             finally:
                 write()
         return results
@@ -191,14 +191,14 @@ def _film(
     agent: Agent,
     specs: Sequence[TaskSpec],
     rows: Mapping[str, Sequence[Row]],
-    plan: Plan,
+    job: EvaluationJob,
     count: int,
     out: Path,
     results: dict[str, Any],
     progress: Progress,
 ) -> None:
     """Make the films and enter them in the results; those that are finished, where it is interrupted."""
-    chosen, trouble = films.choose_all(agent, specs, rows, plan, count, out)
+    chosen, trouble = films.choose_all(agent, specs, rows, job, count, out)
     results["film_trouble"] = [*trouble, "interrupted"]
     try:
         results["film_trouble"] = [*trouble, *films.make(chosen, lambda done: progress("films", done))]
@@ -225,7 +225,7 @@ def _play_task(
     spec: TaskSpec,
     train_seeds: Sequence[int],
     out: Path,
-    plan: Plan,
+    job: EvaluationJob,
     watch: Stopwatch,
     progress: Progress,
 ) -> list[Row]:
@@ -238,12 +238,12 @@ def _play_task(
         }
         for k in train_seeds
     }  # fmt: skip
-    rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, spec, identity, plan)}
+    rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, spec, identity, job)}
     progress(spec.task, len(rows))
     for train_seed in train_seeds:
         policy = watch.timed(agent.policy(spec, train_seed))
         done = [row for (seed, _), row in rows.items() if seed == train_seed]
-        for played in plan.rows(spec, policy, done, lambda more: progress(spec.task, more)):
+        for played in job.rows(spec, policy, done, lambda more: progress(spec.task, more)):
             rows |= {(train_seed, row["world"]): identity[train_seed] | row for row in played}
             _write_rows(path, rows)
     return [rows[key] for key in sorted(rows)]
@@ -255,11 +255,11 @@ def _write_rows(path: Path, rows: Mapping[tuple[int, int], Row]) -> None:
     )
 
 
-def _resumed(path: Path, spec: TaskSpec, identity: Mapping[int, Row], plan: Plan) -> list[Row]:
+def _resumed(path: Path, spec: TaskSpec, identity: Mapping[int, Row], job: EvaluationJob) -> list[Row]:
     """Rows of an earlier, interrupted call.
 
     Raises:
-        ResumeError: they are another agent's, task's or plan's, or damaged.
+        ResumeError: they are another agent's, task's or job's, or damaged.
     """
     if not path.exists():
         return []
@@ -268,19 +268,19 @@ def _resumed(path: Path, spec: TaskSpec, identity: Mapping[int, Row], plan: Plan
         rows = read_rows(path.read_bytes(), str(path), spec)
     except SpecError as error:
         raise ResumeError(
-            f"{error}; choose another --out, or remove the file to play the task anew"
+            f"{error}; choose another --out, or remove the file to play the task again"
         ) from error
     for row in rows:
         expected = identity.get(row["train_seed"])
         if expected is None:
             raise _foreign(path, "train_seed", row["train_seed"], list(identity))
-        seed = plan.told_seed(row["task"], row["world"])
-        expected = expected | {"eval_seed": seed, "split": plan.split}
+        seed = job.told_seed(row["task"], row["world"])
+        expected = expected | {"eval_seed": seed, "split": job.split}
         for name, value in expected.items():
             if row[name] != value:
                 raise _foreign(path, name, row[name], value)
-        if row["world"] >= plan.episodes:
-            raise _foreign(path, "world", row["world"], f"below {plan.episodes}")
+        if row["world"] >= job.episodes:
+            raise _foreign(path, "world", row["world"], f"below {job.episodes}")
     # a longer evaluation may still be finished
     return [row for row in rows if row["status"] != NOT_PLAYED]
 

@@ -33,7 +33,7 @@ STANDARD = "standard"
 SPLITS = (STANDARD, "shift", "forced_death", "ad_hoc")
 """All splits, in the order of tables."""
 _BLIND = "scripted_blind"
-_DOOM, _OTHERS = 0x646F6F6D, 0x6F746872
+_DEATH_SCHEDULE, _OTHERS = 0x646F6F6D, 0x6F746872
 """Second words of the Philox keys; neither an environment nor a policy has them."""
 
 
@@ -51,7 +51,7 @@ class Shift(Params):
     strength: float = pydantic.Field(default=1.0, gt=0, le=4)
 
 
-class Setting(Params):
+class SplitConfig(Params):
     """What a split does to the worlds of a family.
 
     Attributes:
@@ -89,16 +89,16 @@ class Setting(Params):
         family = cast(Family, _Reshaped(registry.family_of(changed), self.shifts[variant]))
         return BatchEnv(changed, family, num_envs, seed, threads=threads)
 
-    def doom(self, seed: int, ids: Int[np.ndarray, "B"], spec: TaskSpec) -> Int[np.ndarray, "B N"]:
+    def death_schedule(self, seed: int, ids: Int[np.ndarray, "B"], spec: TaskSpec) -> Int[np.ndarray, "B N"]:
         """Control step at whose end each agent is killed; -1 for those who are spared."""
         n = spec.num_agents
-        doom = np.full((len(ids), n), -1)
+        schedule = np.full((len(ids), n), -1)
         if self.deaths:
             count = max(1, round(self.deaths * n))
             low, high = (round(share * spec.horizon) for share in self.window)
-            for row, chance in zip(doom, _chances(seed, _DOOM, ids), strict=True):
+            for row, chance in zip(schedule, _chances(seed, _DEATH_SCHEDULE, ids), strict=True):
                 row[chance.permutation(n)[:count]] = chance.integers(low, high, count, endpoint=True)
-        return doom
+        return schedule
 
     def bodies_of_others(
         self, seed: int, ids: Int[np.ndarray, "B"], num_agents: int
@@ -127,7 +127,7 @@ class Setting(Params):
         return network
 
 
-def setting(split: str, spec: TaskSpec) -> Setting:
+def split_config(split: str, spec: TaskSpec) -> SplitConfig:
     """What a split does to a task.
 
     Raises:
@@ -136,7 +136,7 @@ def setting(split: str, spec: TaskSpec) -> Setting:
     if split not in SPLITS:
         raise UnknownNameError(f"no split {split!r}{hint(split, SPLITS)}")
     if split == STANDARD:
-        return Setting()
+        return SplitConfig()
     families = _rules(split)
     if spec.family not in families:
         raise UnknownNameError(f"{spec.task}: {split} has no rules for its family, {spec.family!r}")
@@ -169,10 +169,12 @@ def folder() -> Path:
 
 
 @functools.cache
-def _rules(split: str) -> Mapping[str, Setting]:
+def _rules(split: str) -> Mapping[str, SplitConfig]:
     """Family to what a split does to it."""
     path = folder() / f"{split}.toml"
-    return {family: parse(Setting, values, f"{path}: {family}") for family, values in read_toml(path).items()}
+    return {
+        family: parse(SplitConfig, values, f"{path}: {family}") for family, values in read_toml(path).items()
+    }
 
 
 def _chances(seed: int, purpose: int, ids: Int[np.ndarray, "B"]) -> list[np.random.Generator]:

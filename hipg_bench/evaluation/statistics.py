@@ -2,7 +2,7 @@
 
 The unit of replication is the training run. A method's interval draws its runs with replacement, within
 each task (stratified). With fewer than `METHOD_RUNS` runs that says nothing: then episodes are drawn too,
-and the interval speaks of the episodes' luck, not of the training's. After Agarwal et al. 2021, "Deep
+and the interval speaks of the episodes' randomness, not of the training's. After Agarwal et al. 2021, "Deep
 reinforcement learning at the edge of the statistical precipice"; tested against their library, rliable.
 """
 

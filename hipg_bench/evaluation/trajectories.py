@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from hipg_bench.env import BatchEnv, Step
 from hipg_bench.errors import HipgError
-from hipg_bench.evaluation.episodes import Advance, Plan, silent
+from hipg_bench.evaluation.episodes import Advance, EvaluationJob, silent
 from hipg_bench.evaluation.failures import close
 from hipg_bench.paths import replacing
 from hipg_bench.policies.policy import Policy
@@ -63,24 +63,24 @@ class Trajectory:
 
 
 def trajectories(
-    spec: TaskSpec, policy: Policy, plan: Plan, advance: Advance = silent
+    spec: TaskSpec, policy: Policy, job: EvaluationJob, advance: Advance = silent
 ) -> Iterator[Trajectory]:
-    """Play the plan's worlds and keep everything, episode by episode in the order of worlds.
+    """Play the job's worlds and keep everything, episode by episode in the order of worlds.
 
     Args:
         spec: the task.
         policy: who plays; it is closed at the end.
-        plan: which worlds; they are those of the standard split.
+        job: which worlds; they are those of the standard split.
         advance: told of progress, in episodes.
 
     Raises:
         AgentFailure: the policy's process failed.
     """
     try:
-        for worlds in plan.batches():
-            seed = plan.eval_seed(spec.task, worlds[0])
-            ids = np.array([plan.episode_id(world) for world in worlds])
-            env = make(spec, len(worlds), seed, threads=plan.threads, autoreset=False)
+        for worlds in job.batches():
+            seed = job.eval_seed(spec.task, worlds[0])
+            ids = np.array([job.episode_id(world) for world in worlds])
+            env = make(spec, len(worlds), seed, threads=job.threads, autoreset=False)
             yield from _play(env, policy, seed, ids, advance)
     finally:
         close(policy)

@@ -1,4 +1,4 @@
-"""Some worlds of one evaluation seed, with all that a split does to them, and a policy let loose in them."""
+"""Some worlds of one evaluation seed, with the changes of a split, in which a policy is rolled out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench.env import NEVER, BatchEnv, Step
-from hipg_bench.evaluation.splits import Setting
+from hipg_bench.evaluation.splits import SplitConfig
 from hipg_bench.policies.policy import Policy
 from hipg_bench.spec import TaskSpec
 
@@ -43,24 +43,24 @@ class Worlds:
     """
 
     def __init__(
-        self, spec: TaskSpec, setting: Setting, seed: int, block: int, ids: Int[np.ndarray, "B"],
+        self, spec: TaskSpec, split_config: SplitConfig, seed: int, block: int, ids: Int[np.ndarray, "B"],
         threads: int, *, agent_seed: int,
     ) -> None:  # fmt: skip
         """Build them.
 
         Args:
             spec: the task.
-            setting: what the split does.
+            split_config: what the split does.
             seed: evaluation seed.
             block: which evaluation seed of the task it is, from 0.
             ids: (B,) episodes.
             threads: physics threads, 0 for all cores.
             agent_seed: what the policy is told for its own chance.
         """
-        self.env: BatchEnv = setting.make(spec, block, len(ids), seed, threads)
-        self.others: Bool[np.ndarray, "B N"] = setting.bodies_of_others(seed, ids, spec.num_agents)
-        self._doom = setting.doom(seed, ids, spec)
-        self._background = setting.background_policy(spec)
+        self.env: BatchEnv = split_config.make(spec, block, len(ids), seed, threads)
+        self.others: Bool[np.ndarray, "B N"] = split_config.bodies_of_others(seed, ids, spec.num_agents)
+        self._death_schedule = split_config.death_schedule(seed, ids, spec)
+        self._background = split_config.background_policy(spec)
         self._seed = seed
         self._agent_seed = agent_seed
         self._ids = ids
@@ -81,7 +81,7 @@ class Worlds:
                 told, memory[k] = one.act(seen, memory[k], step.info["alive"])
                 action.append(told)
             team = action[0] if len(action) == 1 else np.where(self.others[..., None], action[1], action[0])
-            step = self._strike(self.env.step(team))
+            step = self._apply_forced_deaths(self.env.step(team))
 
     def deaths(self, last: Float[np.ndarray, "R"]) -> list[Death]:
         """Who died in an episode, in the order of death, read off its last state row."""
@@ -93,10 +93,10 @@ class Worlds:
     def _name(self, cause: float) -> str:
         return FORCED if cause == _FORCED_CAUSE else self.env.family.causes[int(cause)]
 
-    def _strike(self, step: Step) -> Step:
+    def _apply_forced_deaths(self, step: Step) -> Step:
         """Kill those whose time has come: after a step, before anybody acts on what came of it."""
         going_on = (step.info["episode_id"] == self._ids) & ~(step.terminated | step.truncated)
-        due = (self._doom == step.info["elapsed"][:, None]) & step.info["alive"] & going_on[:, None]
+        due = (self._death_schedule == step.info["elapsed"][:, None]) & step.info["alive"] & going_on[:, None]
         (struck,) = due.any(axis=1).nonzero()
         if not len(struck):
             return step

@@ -22,9 +22,9 @@ from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.leaderboard import films
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Entry, now
-from hipg_bench.leaderboard.playing import Match, Progress, keep, limited, play, played_tasks, quiet
+from hipg_bench.leaderboard.entry_view import rows_path, run_path
+from hipg_bench.leaderboard.playing import BoardEvaluation, Progress, keep, limited, play, played_tasks, quiet
 from hipg_bench.leaderboard.rows import MOST_BYTES
-from hipg_bench.leaderboard.shown import rows_path, run_path
 from hipg_bench.leaderboard.source import BUNDLE, Source
 from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
@@ -50,7 +50,7 @@ class Added:
 def add(
     board: Board,
     source: Source,
-    match: Match,
+    evaluation: BoardEvaluation,
     *,
     claims: Path | None = None,
     replace: bool = False,
@@ -62,7 +62,7 @@ def add(
     Args:
         board: where.
         source: who.
-        match: what is played.
+        evaluation: what is played.
         claims: folder with the submitter's rows, if they are to be compared with later.
         replace: take the place of an entry of the same name, which goes into the board's history.
         film_tasks: of which tasks a film is made.
@@ -82,18 +82,18 @@ def add(
     with board.draft(agent.name, earlier) as folder:
         _copy_card(source, folder)
         work = folder / ".work"
-        claimed = [split for split in match.splits if claims is not None and _bring(claims, split, work)]
+        claimed = [split for split in evaluation.splits if claims is not None and _bring(claims, split, work)]
         if claims is not None and not claimed:
             raise BoardError(f"{claims} holds no rows: <split>/episodes/<task>.jsonl is expected")
         hashes: dict[str, str] = {}
-        for split in match.splits:
-            run = play(agent, match, split, work, progress=progress)
+        for split in evaluation.splits:
+            run = play(agent, evaluation, split, work, progress=progress)
             _refuse_alike(run)
             hashes |= keep(run, folder, split)
         _copy_curves(agent, folder)
         _keep_films(board, earlier, hashes, folder)
-        trouble = films.make(agent, match, film_tasks, work, folder, progress)
-        policies = {task: agent.train_seeds(task) for task in played_tasks(work / match.splits[0])}
+        trouble = films.make(agent, evaluation, film_tasks, work, folder, progress)
+        policies = {task: agent.train_seeds(task) for task in played_tasks(work / evaluation.splits[0])}
         privileged = any(
             agent.policy(task_spec(task), seeds[0]).privileged for task, seeds in policies.items()
         )

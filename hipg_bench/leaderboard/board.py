@@ -139,7 +139,7 @@ class Board:
 
     @contextlib.contextmanager
     def _alone(self) -> Generator[None]:
-        """Be the only one that renames things here, after those who were killed doing so."""
+        """Take the board's lock; clean up what killed processes left."""
         if not self.root.is_dir():
             self.root.mkdir(parents=True, exist_ok=True)
         with FileLock(self.root / ".lock"):
@@ -202,13 +202,13 @@ class Board:
         """Remove the drafts of processes that are no more."""
         for lock in self.root.glob(f"{_DRAFT}*.lock"):
             if not lock.with_suffix("").exists():
-                self._bury(lock.with_suffix(""))
+                self._remove_stale_draft(lock.with_suffix(""))
         for draft in self.root.glob(f"{_DRAFT}*"):
             if draft.is_dir():
-                self._bury(draft)
+                self._remove_stale_draft(draft)
 
     @staticmethod
-    def _bury(draft: Path) -> None:
+    def _remove_stale_draft(draft: Path) -> None:
         lock = FileLock(_lock_of(draft))
         try:
             lock.acquire(timeout=0)

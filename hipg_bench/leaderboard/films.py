@@ -10,8 +10,8 @@ from pathlib import Path
 import imageio_ffmpeg
 
 from hipg_bench.errors import HipgError, RenderError
-from hipg_bench.evaluation.episodes import Plan, Row
-from hipg_bench.leaderboard.playing import Match, Progress
+from hipg_bench.evaluation.episodes import EvaluationJob, Row
+from hipg_bench.leaderboard.playing import BoardEvaluation, Progress
 from hipg_bench.leaderboard.rows import parse_rows
 from hipg_bench.paths import replacing
 from hipg_bench.policies.bundle import Agent
@@ -36,17 +36,22 @@ _SMALL = (
 
 
 def make(
-    agent: Agent, match: Match, tasks: Sequence[str], work: Path, folder: Path, progress: Progress
+    agent: Agent,
+    evaluation: BoardEvaluation,
+    tasks: Sequence[str],
+    work: Path,
+    folder: Path,
+    progress: Progress,
 ) -> list[str]:
     """Film an agent in tasks that it plays and has no film of; return what went wrong."""
-    plan = match.plan("standard")
+    job = evaluation.job("standard")
     trouble: list[str] = []
     for task in tasks:
         rows = work / "standard" / "episodes" / f"{task}.jsonl"
         row = _row(rows) if rows.is_file() else None
         if row is not None and not (folder / "films" / f"{task}.mp4").exists():
             try:
-                _film(agent, task, row, plan, folder / "films" / f"{task}.mp4")
+                _film(agent, task, row, job, folder / "films" / f"{task}.mp4")
             except HipgError as error:
                 trouble.append(f"{task}: {error}")
         progress("films", 1.0, len(tasks))
@@ -59,14 +64,14 @@ def _row(path: Path) -> Row | None:
     return next((row for row in rows if row["world"] == WORLD and row["status"] == "ok"), None)
 
 
-def _film(agent: Agent, task: str, row: Row, plan: Plan, out: Path) -> None:
+def _film(agent: Agent, task: str, row: Row, job: EvaluationJob, out: Path) -> None:
     """Play the world again and film it.
 
     Raises:
         HipgError: it came out otherwise, or no frame can be rendered.
     """
     spec = task_spec(task)
-    states = plan.record(spec, agent.policy(spec, row["train_seed"]), row)
+    states = job.record(spec, agent.policy(spec, row["train_seed"]), row)
     with tempfile.TemporaryDirectory(prefix="hipg-film-") as place:
         large = Path(place) / out.name
         film.record(spec, states, large, agent=agent.name, size=_SIZE, fps=_FPS, end_reason=row["end_reason"])

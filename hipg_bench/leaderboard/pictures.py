@@ -10,7 +10,7 @@ from hipg_bench.evaluation import splits
 from hipg_bench.evaluation.ranking import better
 from hipg_bench.evaluation.statistics import CLIP, Interval
 from hipg_bench.leaderboard.charts import Chart, Series, chart
-from hipg_bench.leaderboard.shown import Shown
+from hipg_bench.leaderboard.entry_view import EntryView
 from hipg_bench.leaderboard.standings import Line, Panel
 from hipg_bench.spec import TaskSpec
 
@@ -31,15 +31,15 @@ class Better:
     shares: Sequence[Sequence[tuple[float, Interval] | None]]
 
 
-def drawn(panel: Panel) -> list[Shown]:
+def drawn(panel: Panel) -> list[EntryView]:
     """The best entries, and all references, in the order of the table."""
     lines = [*panel.verified, *panel.reported]
     best = sorted((line for line in lines if line.rank is not None), key=lambda line: -line.score)[:COLOURS]
-    kept = {line.shown.name for line in best} | {line.shown.name for line in lines if line.rank is None}
-    return [line.shown for line in lines if line.shown.name in kept]
+    kept = {line.view.name for line in best} | {line.view.name for line in lines if line.rank is None}
+    return [line.view for line in lines if line.view.name in kept]
 
 
-def colours(entries: Sequence[Shown]) -> dict[str, str]:
+def colours(entries: Sequence[EntryView]) -> dict[str, str]:
     """Entry to its class in the style sheet, the same on all pages."""
     found: dict[str, str] = {}
     for one in entries:
@@ -63,10 +63,10 @@ def overview(panels: Sequence[Panel], specs: Sequence[TaskSpec]) -> dict[str, An
     }
 
 
-def task(entries: Sequence[Shown], shown: Sequence[Shown], spec: TaskSpec) -> dict[str, Any]:
+def task(entries: Sequence[EntryView], on_page: Sequence[EntryView], spec: TaskSpec) -> dict[str, Any]:
     """What a task's page shows."""
-    colour = colours(shown)
-    players = [one for one in shown if one.task("standard", spec.task) is not None]
+    colour = colours(on_page)
+    players = [one for one in on_page if one.task("standard", spec.task) is not None]
     found = [(one, one.task(split, spec.task), split) for split in splits.SPLITS for one in entries]
     return {
         "colour": colour,
@@ -84,7 +84,7 @@ def task(entries: Sequence[Shown], shown: Sequence[Shown], spec: TaskSpec) -> di
     }
 
 
-def agent(one: Shown, specs: Sequence[TaskSpec]) -> dict[str, Any]:
+def agent(one: EntryView, specs: Sequence[TaskSpec]) -> dict[str, Any]:
     """What an entry's page shows."""
     colour = {one.name: "c0"}
     by_task = {
@@ -105,7 +105,7 @@ def agent(one: Shown, specs: Sequence[TaskSpec]) -> dict[str, Any]:
 
 def _lines(panel: Panel, colour: Mapping[str, str]) -> list[Line]:
     """The lines of a table that charts show."""
-    return [line for line in (*panel.verified, *panel.reported) if line.shown.name in colour]
+    return [line for line in (*panel.verified, *panel.reported) if line.view.name in colour]
 
 
 def _profile(lines: Sequence[Line], colour: Mapping[str, str]) -> Chart | None:
@@ -114,7 +114,7 @@ def _profile(lines: Sequence[Line], colour: Mapping[str, str]) -> Chart | None:
     for line in lines:
         profile = line.result["aggregate"]["profile"]
         points = list(zip(profile["thresholds"], profile["share"], strict=True))
-        series.append(Series(line.shown.name, colour[line.shown.name], points, stairs=True))
+        series.append(Series(line.view.name, colour[line.view.name], points, stairs=True))
     return chart(
         series, x_label="score", y_label="share above it", x_limits=CLIP, y_limits=(0.0, 1.02), legend=True
     )  # fmt: skip
@@ -122,21 +122,21 @@ def _profile(lines: Sequence[Line], colour: Mapping[str, str]) -> Chart | None:
 
 def _better(lines: Sequence[Line]) -> Better:
     return Better(
-        [line.shown.name for line in lines],
+        [line.view.name for line in lines],
         [[None if a is b else better(a.result, b.result) for b in lines] for a in lines],
     )
 
 
-def _best_film(panel: Panel, spec: TaskSpec) -> tuple[Shown, Line] | None:
+def _best_film(panel: Panel, spec: TaskSpec) -> tuple[EntryView, Line] | None:
     """Who of the ranked has the best film of a task."""
-    lines = [line for line in (*panel.verified, *panel.reported) if spec.task in line.shown.films]
-    ranked = [line for line in lines if line.rank is not None and line.shown.task("standard", spec.task)]
-    best = max(ranked, key=lambda line: line.shown.task("standard", spec.task)["return_mean"], default=None)  # type: ignore[index]
-    return (best.shown, best) if best else None
+    lines = [line for line in (*panel.verified, *panel.reported) if spec.task in line.view.films]
+    ranked = [line for line in lines if line.rank is not None and line.view.task("standard", spec.task)]
+    best = max(ranked, key=lambda line: line.view.task("standard", spec.task)["return_mean"], default=None)  # type: ignore[index]
+    return (best.view, best) if best else None
 
 
 def _learning(
-    entries: Sequence[Shown], spec: TaskSpec, colour: Mapping[str, str], *, alone: bool = False
+    entries: Sequence[EntryView], spec: TaskSpec, colour: Mapping[str, str], *, alone: bool = False
 ) -> Chart | None:
     """Return over environment steps, a curve per trained policy."""
     series = [
@@ -149,7 +149,7 @@ def _learning(
     return chart(series, x_label="environment steps", y_label="team return", levels=_anchors(spec))
 
 
-def _by_deaths(entries: Sequence[Shown], spec: TaskSpec, colour: Mapping[str, str]) -> Chart | None:
+def _by_deaths(entries: Sequence[EntryView], spec: TaskSpec, colour: Mapping[str, str]) -> Chart | None:
     """Mean return of the episodes in which so many agents died."""
     series: list[Series] = []
     for one in entries:

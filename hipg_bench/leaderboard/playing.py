@@ -13,12 +13,12 @@ from typing import Any, cast
 from hipg_bench import registry
 from hipg_bench.errors import BoardError
 from hipg_bench.evaluation import runner, splits
-from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.episodes import EvaluationJob, Row
 from hipg_bench.evaluation.results import aggregate
 from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.evaluation.splits import SPLITS
+from hipg_bench.leaderboard.entry_view import Worlds, rows_path, run_path
 from hipg_bench.leaderboard.rows import pack
-from hipg_bench.leaderboard.shown import Worlds, rows_path, run_path
 from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
 
@@ -58,7 +58,7 @@ def limited(progress: Progress, hours: float = MOST_HOURS) -> Progress:
 
 
 @dataclasses.dataclass(frozen=True)
-class Match:
+class BoardEvaluation:
     """What is played for an entry.
 
     Attributes:
@@ -77,18 +77,24 @@ class Match:
         """The tasks."""
         return runner.Suite(SUITE, tuple(registry.task_spec(task) for task in self.tasks))
 
-    def plan(self, split: str, salt: bytes | None = None, luck: str = "") -> Plan:
-        """The worlds of a split: public ones, or those hidden behind a salt; see `Plan` for ``luck``."""
-        return Plan(episodes=self.episodes, threads=self.threads, split=split, salt=salt, luck=luck)
+    def job(self, split: str, salt: bytes | None = None, agent_seed_key: str = "") -> EvaluationJob:
+        """The worlds of a split: public ones, or those hidden behind a salt, as `EvaluationJob` describes."""
+        return EvaluationJob(
+            episodes=self.episodes,
+            threads=self.threads,
+            split=split,
+            salt=salt,
+            agent_seed_key=agent_seed_key,
+        )
 
 
 def play(
     agent: Agent,
-    match: Match,
+    evaluation: BoardEvaluation,
     split: str,
     work: Path,
     salt: bytes | None = None,
-    luck: str = "",
+    agent_seed_key: str = "",
     progress: Progress = quiet,
 ) -> Path:
     """Play a split, or finish what lies in ``work``; return the evaluation's folder.
@@ -98,14 +104,14 @@ def play(
         ResumeError: the rows in ``work`` are of another agent, task or version.
     """
     worlds: Worlds = "public" if salt is None else "hidden"
-    suite = match.suite()
+    suite = evaluation.suite()
     seeds, _ = runner.playable(agent, suite)
-    total = match.episodes * sum(len(found) for found in seeds.values())
+    total = evaluation.episodes * sum(len(found) for found in seeds.values())
     stage = f"{split}, {worlds} worlds"
     progress(stage, 0.0, total)
     out = work / run_path(worlds, split)
     runner.evaluate(
-        agent, suite, out, match.plan(split, salt, luck),
+        agent, suite, out, evaluation.job(split, salt, agent_seed_key),
         progress=lambda task, done: progress(stage, done, total) if task in seeds else None,
     )  # fmt: skip
     return out

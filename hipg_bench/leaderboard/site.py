@@ -29,8 +29,8 @@ from hipg_bench.errors import BoardError, HipgError
 from hipg_bench.evaluation import export, splits
 from hipg_bench.leaderboard import pictures, standings
 from hipg_bench.leaderboard.board import Board
+from hipg_bench.leaderboard.entry_view import EntryView, read_entry_view
 from hipg_bench.leaderboard.salt import Commitments, read_commitments
-from hipg_bench.leaderboard.shown import Shown, read_shown
 from hipg_bench.spec import TaskSpec
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -57,7 +57,7 @@ STATUS_SAYS = {
 class View:
     """What all pages draw from."""
 
-    entries: Sequence[Shown]
+    entries: Sequence[EntryView]
     specs: Sequence[TaskSpec]
     panels: Sequence[standings.Panel]
     commitments: Commitments
@@ -69,7 +69,7 @@ class View:
         return list(dict.fromkeys(panel.split for panel in self.panels))
 
     @property
-    def drawn(self) -> list[Shown]:
+    def drawn(self) -> list[EntryView]:
         """The entries that charts show: the best ones, and the references."""
         return pictures.drawn(self.panels[0]) if self.panels else []
 
@@ -107,13 +107,13 @@ def build(board: Board, out: Path) -> View:
     return view
 
 
-def _entries(board: Board, specs: Sequence[TaskSpec]) -> tuple[list[Shown], dict[str, str]]:
+def _entries(board: Board, specs: Sequence[TaskSpec]) -> tuple[list[EntryView], dict[str, str]]:
     """The entries that can be shown, and why the others cannot."""
     commitment = read_commitments(board.root).sha256
-    entries, left_out = list[Shown](), dict[str, str]()
+    entries, left_out = list[EntryView](), dict[str, str]()
     for name in board.names():
         try:
-            one = read_shown(board.folder(name), commitment)
+            one = read_entry_view(board.folder(name), commitment)
             # all that is computed of it, by itself: one entry's damage must not break the page of the others
             pictures.agent(one, specs)
             pictures.overview(standings.panels([one], specs), specs)
@@ -237,7 +237,7 @@ def _data(view: View, out: Path) -> None:
     summary = [
         {
             "split": panel.split, "family": panel.family, "worlds": worlds, "rank": line.rank,
-            "name": line.shown.name, "status": line.shown.status, "kind": line.shown.kind,
+            "name": line.view.name, "status": line.view.status, "kind": line.view.kind,
             "score_iqm": line.score, "score_iqm_ci95": line.ci95, "survival": line.survival,
             "deaths": line.deaths, "tasks_played": line.played, "tasks": line.tasks, "dnf": line.dnf,
         }
@@ -252,7 +252,7 @@ def _data(view: View, out: Path) -> None:
         (out / f"marl_eval_{split}.json").write_text(document, encoding="utf-8")
 
 
-def _marl_eval(entries: Sequence[Shown], split: str) -> export.Document:
+def _marl_eval(entries: Sequence[EntryView], split: str) -> export.Document:
     """A split's episodes on public worlds in marl-eval's form: rows of hidden ones are not published."""
     with tempfile.TemporaryDirectory(prefix="hipg-export-") as place:
         folders: list[Path] = []

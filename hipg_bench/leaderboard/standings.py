@@ -11,8 +11,8 @@ import numpy as np
 from hipg_bench.evaluation import splits
 from hipg_bench.evaluation.ranking import rank
 from hipg_bench.evaluation.results import aggregate
+from hipg_bench.leaderboard.entry_view import EntryView
 from hipg_bench.leaderboard.playing import ALL
-from hipg_bench.leaderboard.shown import Shown
 from hipg_bench.spec import TaskSpec
 
 
@@ -21,7 +21,7 @@ class Line:
     """A line of a table.
 
     Attributes:
-        shown: whose.
+        view: whose.
         result: its results on the split, with the table's tasks only.
         rank: from 1; None for references.
         survival: share of agents alive at the end, mean over tasks.
@@ -30,7 +30,7 @@ class Line:
         public: the score on public worlds, where that of hidden ones counts and the table has all families.
     """
 
-    shown: Shown
+    view: EntryView
     result: Mapping[str, Any]
     rank: int | None
     survival: float | None
@@ -74,7 +74,7 @@ class Panel:
     reported: Sequence[Line]
 
 
-def panels(entries: Sequence[Shown], specs: Sequence[TaskSpec]) -> list[Panel]:
+def panels(entries: Sequence[EntryView], specs: Sequence[TaskSpec]) -> list[Panel]:
     """Every table there is something to say in."""
     families = [ALL, *dict.fromkeys(spec.family for spec in specs)]
     return [
@@ -85,7 +85,7 @@ def panels(entries: Sequence[Shown], specs: Sequence[TaskSpec]) -> list[Panel]:
     ]
 
 
-def _panel(entries: Sequence[Shown], specs: Sequence[TaskSpec], split: str, family: str) -> Panel:
+def _panel(entries: Sequence[EntryView], specs: Sequence[TaskSpec], split: str, family: str) -> Panel:
     chosen = [splits.with_anchors(split, spec) for spec in specs if family in (ALL, spec.family)]
     there = [one for one in entries if _scored(one, split)]
     return Panel(
@@ -96,13 +96,13 @@ def _panel(entries: Sequence[Shown], specs: Sequence[TaskSpec], split: str, fami
     )
 
 
-def _scored(one: Shown, split: str) -> bool:
+def _scored(one: EntryView, split: str) -> bool:
     """Whether an entry played a split whose anchors are measured."""
     result = one.result(split)
     return result is not None and result["aggregate"]["score_iqm"] is not None
 
 
-def _line(one: Shown, specs: Sequence[TaskSpec], split: str, family: str) -> Line:
+def _line(one: EntryView, specs: Sequence[TaskSpec], split: str, family: str) -> Line:
     names = [spec.task for spec in specs]
     result = dict(one.result(split) or {})
     tasks = [task for task in result["tasks"] if task["task"] in names]
@@ -117,7 +117,7 @@ def _line(one: Shown, specs: Sequence[TaskSpec], split: str, family: str) -> Lin
         result |= {"tasks": tasks, "aggregate": aggregate(rows), "kind": one.kind}
     public = one.results.get(("public", split)) if one.worlds == "hidden" and family == ALL else None
     return Line(
-        shown=one,
+        view=one,
         result=result,
         rank=None,
         survival=_mean([task["survival"] for task in tasks]),
@@ -129,7 +129,7 @@ def _line(one: Shown, specs: Sequence[TaskSpec], split: str, family: str) -> Lin
 
 def _ranked(lines: Sequence[Line]) -> list[Line]:
     """In the order of the protocol: methods, checkpoints, references."""
-    named = {line.shown.name: line for line in lines}
+    named = {line.view.name: line for line in lines}
     standings = rank({name: line.result for name, line in named.items()})
     return [dataclasses.replace(named[one.name], rank=one.place) for one in standings]
 

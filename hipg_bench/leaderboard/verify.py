@@ -18,10 +18,10 @@ from hipg_bench.evaluation.episodes import versions
 from hipg_bench.evaluation.seeds import SUITE, commitment
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
-from hipg_bench.leaderboard.playing import Match, Progress, keep_hidden, limited, play, quiet
+from hipg_bench.leaderboard.entry_view import EntryView, read_entry_view, rows_path
+from hipg_bench.leaderboard.playing import BoardEvaluation, Progress, keep_hidden, limited, play, quiet
 from hipg_bench.leaderboard.rows import compare, unpack
 from hipg_bench.leaderboard.salt import read_commitments
-from hipg_bench.leaderboard.shown import Shown, read_shown, rows_path
 from hipg_bench.leaderboard.source import Source, reopened
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.sandbox import choice
@@ -74,24 +74,24 @@ def verify(
     promised = read_commitments(board.root).sha256
     if commitment(salt) != promised:
         raise BoardError(f"this salt is not the one that {board.root} is bound to")
-    shown = read_shown(folder, promised)
+    view = read_entry_view(folder, promised)
     date = now()
-    luck = f"{name}|{shown.entry.version}|{date}"
+    agent_seed_key = f"{name}|{view.entry.version}|{date}"
     with (
         board.workspace("verify") as work,
-        reopened(shown.folder, shown.entry, work, trust=trust) as source,
-        board.draft(name, shown.entry) as draft,
+        reopened(view.folder, view.entry, work, trust=trust) as source,
+        board.draft(name, view.entry) as draft,
     ):
-        shutil.copytree(shown.folder, draft, dirs_exist_ok=True)
+        shutil.copytree(view.folder, draft, dirs_exist_ok=True)
         shutil.rmtree(draft / "hidden", ignore_errors=True)
-        rows = {path: digest for path, digest in shown.entry.rows.items() if not path.startswith("hidden/")}
-        seen = _compare(shown, source.agent, work, threads, progress)
-        execution, said = _audit(source.agent, shown, salt, luck)
-        outcome, reasons = _outcome(shown.entry, source, seen)
+        rows = {path: digest for path, digest in view.entry.rows.items() if not path.startswith("hidden/")}
+        seen = _compare(view, source.agent, work, threads, progress)
+        execution, said = _audit(source.agent, view, salt, agent_seed_key)
+        outcome, reasons = _outcome(view.entry, source, seen)
         if outcome != "mismatch":
-            for split, match in _matches(shown, threads).items():
-                run = play(source.agent, match, split, work, salt, luck, progress)
-                rows |= keep_hidden(run, draft, private / name / f"v{shown.entry.version}", split)
+            for split, evaluation in _evaluations(view, threads).items():
+                run = play(source.agent, evaluation, split, work, salt, agent_seed_key, progress)
+                rows |= keep_hidden(run, draft, private / name / f"v{view.entry.version}", split)
         found = Verification(
             date=date,
             outcome=outcome,
@@ -104,20 +104,20 @@ def verify(
             reasons=(*reasons, *said),
             versions=versions(),
         )
-        board.write(draft, shown.entry.model_copy(update={"rows": rows, "verification": found}))
+        board.write(draft, view.entry.model_copy(update={"rows": rows, "verification": found}))
     return found
 
 
-def _matches(shown: Shown, threads: int) -> dict[str, Match]:
+def _evaluations(view: EntryView, threads: int) -> dict[str, BoardEvaluation]:
     """What was played of each split when the entry was made."""
     return {
-        split: Match(
+        split: BoardEvaluation(
             tasks=_in_order([one["task"] for one in (*result["tasks"], *result["skipped"])]),
             splits=(split,),
             episodes=result["episodes_per_policy"],
             threads=threads,
         )
-        for (worlds, split), result in shown.results.items()
+        for (worlds, split), result in view.results.items()
         if worlds == "public"
     }
 
@@ -127,16 +127,16 @@ def _in_order(tasks: Sequence[str]) -> tuple[str, ...]:
     return tuple(task for task in registry.tasks() if task in tasks)
 
 
-def _compare(shown: Shown, agent: Agent, work: Path, threads: int, progress: Progress) -> _Comparison:
+def _compare(view: EntryView, agent: Agent, work: Path, threads: int, progress: Progress) -> _Comparison:
     """Play the public worlds again, and compare row by row."""
     compared, differences = 0, list[Difference]()
-    for split, match in _matches(shown, threads).items():
-        run = play(agent, match, split, work, progress=progress)
+    for split, evaluation in _evaluations(view, threads).items():
+        run = play(agent, evaluation, split, work, progress=progress)
         ours = {path.stem: path.read_bytes() for path in (run / "episodes").glob("*.jsonl")}
         theirs = {
-            task: unpack(shown.folder / path)
-            for task in match.tasks
-            if (path := rows_path("public", split, task)) in shown.entry.rows
+            task: unpack(view.folder / path)
+            for task in evaluation.tasks
+            if (path := rows_path("public", split, task)) in view.entry.rows
         }
         for task in sorted({*ours, *theirs}):
             differences += compare(split, task, theirs.get(task, b""), ours.get(task, b""))
@@ -144,19 +144,23 @@ def _compare(shown: Shown, agent: Agent, work: Path, threads: int, progress: Pro
     return _Comparison(compared, differences)
 
 
-def _audit(agent: Agent, shown: Shown, salt: bytes, luck: str) -> tuple[Execution, tuple[str, ...]]:
+def _audit(
+    agent: Agent, view: EntryView, salt: bytes, agent_seed_key: str
+) -> tuple[Execution, tuple[str, ...]]:
     """Whether each agent acts on what it sees alone: so by construction, or by replay of code of others."""
-    if shown.entry.privileged or agent.card.execution == "centralised":
+    if view.entry.privileged or agent.card.execution == "centralised":
         return "centralised", ()
     if agent.card.tier != 2:
         return "decentralised", ()
-    match = _matches(shown, threads=1).get("standard") or next(iter(_matches(shown, threads=1).values()))
-    plan = match.plan("standard", salt, luck)
-    worlds = next(plan.batches())
-    for task, seeds in shown.entry.policies.items():
+    evaluation = _evaluations(view, threads=1).get("standard") or next(
+        iter(_evaluations(view, threads=1).values())
+    )
+    job = evaluation.job("standard", salt, agent_seed_key)
+    worlds = next(job.batches())
+    for task, seeds in view.entry.policies.items():
         spec = registry.task_spec(task)
         for seed in seeds:
-            verdict = decentralised.verify(spec, agent.policy(spec, seed), plan, worlds)
+            verdict = decentralised.verify(spec, agent.policy(spec, seed), job, worlds)
             if not verdict.decentralised:
                 return "centralised", (f"{task}, training seed {seed}: {verdict}",)
     return "decentralised", ()

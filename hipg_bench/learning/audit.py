@@ -2,7 +2,7 @@
 
 The min-health baseline asks the critic about states that training hardly visits. State rows make the
 true answer measurable: fork a world, kill agent i in the fork, let the same policy finish the episode
-many times with fresh luck, and average the discounted returns.
+many times with fresh random numbers, and average the discounted returns.
 
 Value targets bootstrap at the horizon (`Settings.bootstrap_truncation`), so that what the critic has
 learned goes on beyond it; then the true worlds do so too, until what follows is discounted to 1 %.
@@ -111,8 +111,8 @@ def audit(
         settings: of the run; ``gamma`` discounts, ``weights`` price.
         worlds: episodes that states are taken from.
         moments: states per episode, evenly spread over the horizon.
-        repeats: rollouts per case, each with luck of its own.
-        seed: of the episodes and of all luck.
+        repeats: rollouts per case, each with its own random numbers.
+        seed: of the episodes and of all random numbers.
     """
     torch.manual_seed(seed)
     chance = np.random.default_rng(seed)
@@ -211,8 +211,8 @@ def _networks(path: Path) -> tuple[dict[str, dict[str, Tensor]], str]:
     }, text
 
 
-def redraw_luck(env: BatchEnv, rows: Float[np.ndarray, "X R"], chance: np.random.Generator) -> None:
-    """Draw anew, in place, how much more each agent can take.
+def redraw_randomness(env: BatchEnv, rows: Float[np.ndarray, "X R"], chance: np.random.Generator) -> None:
+    """Redraw in place how much more each agent can take.
 
     Toughness is exponential: given that the exposure so far killed nobody who lives, what is left of
     it is exponential again.
@@ -276,13 +276,13 @@ def _true(
 def _returns(
     actor: Actor, settings: Settings, rows: Float[np.ndarray, "X R"], chance: np.random.Generator
 ) -> Float[np.ndarray, "X"]:
-    """Discounted return from every row to the end of its episode, with fresh luck."""
+    """Discounted return from every row to the end of its episode, with fresh random numbers."""
     horizon = task_spec(settings.task).horizon
     if settings.bootstrap_truncation and settings.gamma < 1:
         horizon += math.ceil(math.log(_NEGLIGIBLE) / math.log(max(settings.gamma, 1e-9)))
     env = make(settings.task, len(rows), weights=settings.weights, horizon=horizon)
     rows = rows.copy()
-    redraw_luck(env, rows, chance)
+    redraw_randomness(env, rows, chance)
     step = env.load_rows(np.arange(len(rows)), rows)
     total, discount, running = np.zeros(len(rows)), 1.0, np.ones(len(rows), bool)
     for _ in range(horizon):

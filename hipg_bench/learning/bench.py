@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from hipg_bench.errors import SpecError
-from hipg_bench.learning import arithmetic
+from hipg_bench.learning import torch_setup
 from hipg_bench.learning.mappo import Trainer
 from hipg_bench.learning.settings import Settings, recommended
 
@@ -61,7 +61,7 @@ def iteration_time(
     if not isinstance(settings, Settings):
         raise SpecError(f"{task}: the algorithms of MAPPO are timed, got {settings.algorithm!r}")
     torch.set_num_threads(threads)
-    arithmetic.prepare()
+    torch_setup.configure()
     trainer = Trainer(settings)
     _iterate(trainer)
     parts: list[tuple[float, float, float]] = []

@@ -24,7 +24,7 @@ from hipg_bench.learning.settings import Settings
 from hipg_bench.registry import make
 
 _LIFE = 5
-"""Mean steps until a fork gives way to a fresh one, unless its episode ends before."""
+"""Mean steps until a fork is overwritten by a fresh one, unless its episode ends before."""
 
 
 class Forks:

@@ -54,7 +54,7 @@ def gradient_noise(
         critic: of the joint state.
         settings: of the run, as `hipg_bench.learning.audit.load` gives them.
         worlds: episodes, two or more.
-        seed: of the episodes and of all luck.
+        seed: of the episodes and of all random numbers.
     """
     whole = {"rollout": task_spec(settings.task).horizon, "num_envs": worlds, "seed": seed}
     trainer = Trainer(settings.model_copy(update={**whole, "forks": 0.0, "spontaneous_deaths": 0.0}))

@@ -27,7 +27,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from hipg_bench.learning.replay import ReplayTrainer
 from hipg_bench.learning.settings import MaddpgSettings
-from hipg_bench.policies.network import Form
+from hipg_bench.policies.network import NetworkSpec
 
 
 class Actors(nn.Module):
@@ -81,7 +81,7 @@ class Trainer(ReplayTrainer):
         """Make worlds and networks; the replay is kept in ``folder``."""
         super().__init__(settings, folder)
         env, self.options = self.env, settings
-        self.form = Form(activation="relu", head="tanh", reach=settings.action_scale)
+        self.spec = NetworkSpec(activation="relu", head="tanh", reach=settings.action_scale)
         actors = Actors(env.num_agents, env.observation_size, env.action_size, settings.hidden)
         self.body = actors.body
         self.actor = TensorDictModule(actors, ["observation", "acting"], ["unsquashed", "action"])

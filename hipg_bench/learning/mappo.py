@@ -30,7 +30,7 @@ from hipg_bench.learning.gae import gae
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
 from hipg_bench.paths import replacing
-from hipg_bench.policies.network import AttentionForm, Form, load_network, save_network
+from hipg_bench.policies.network import AttentionSpec, NetworkSpec, load_network, save_network
 from hipg_bench.registry import make
 
 _RATES = (1e-5, 2e-3)
@@ -326,16 +326,16 @@ class Trainer:
         Raises:
             BundleError: it is none, or its network is another than the settings'.
         """
-        form = load_network(path).form  # nothing in the file is believed before it is checked
-        if form != self.actor.form:
-            raise BundleError(f"{path}: a start must declare this run's {self.actor.form!r}, got {form!r}")
+        spec = load_network(path).spec  # nothing in the file is believed before it is checked
+        if spec != self.actor.spec:
+            raise BundleError(f"{path}: a start must declare this run's {self.actor.spec!r}, got {spec!r}")
         settings = self.settings
         samples = settings.num_envs * settings.rollout * self.env.num_agents
         self.actor.adopt(load_file(path), _START_COUNTS * samples)
 
     def save_policy(self, path: Path) -> None:
         """Write the policy file: the mean action's network."""
-        save_network(self.actor.tensors(), path, self.actor.form)
+        save_network(self.actor.tensors(), path, self.actor.spec)
 
     def save_networks(self, path: Path) -> None:
         """Write actor and critic with all they normalise by, as safetensors: what an audit needs."""
@@ -400,7 +400,7 @@ def networks(settings: Settings, layout: TaskLayout, *, clips: bool) -> tuple[Ac
         layout.action.size,
         settings.actor_hidden,
         settings.initial_std,
-        form=AttentionForm.of(layout.observation, *groups, head=head) if groups else Form(head=head),
+        spec=AttentionSpec.of(layout.observation, *groups, head=head) if groups else NetworkSpec(head=head),
         normalize=settings.normalize_inputs,
     )
     local = settings.algorithm == "local"

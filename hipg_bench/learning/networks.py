@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hipg_bench.errors import BundleError
-from hipg_bench.policies.network import CLIP, AttentionForm, Form
+from hipg_bench.policies.network import CLIP, AttentionSpec, NetworkSpec
 
 
 class RunningNorm(nn.Module):
@@ -105,13 +105,13 @@ class AttentionBody(nn.Module):
     the embeddings of the slots, and these are mixed before they become a value.
     """
 
-    def __init__(self, form: AttentionForm, hidden: tuple[int, ...], action_size: int) -> None:
+    def __init__(self, spec: AttentionSpec, hidden: tuple[int, ...], action_size: int) -> None:
         super().__init__()
-        own, slots = form.columns()
+        own, slots = spec.columns()
         size, gain = hidden[0], math.sqrt(2)
         self._own = torch.as_tensor(own)
         self._slots = {group: torch.as_tensor(columns) for group, columns in slots.items()}
-        self._present = form.present_columns()
+        self._present = spec.present_columns()
         self.own = mlp((own.size, size), Tanh, gain)
         self.slot = nn.ModuleDict(
             {group: mlp((at.shape[1], size), Tanh, gain) for group, at in slots.items()}
@@ -177,7 +177,7 @@ class Actor(nn.Module):
     """A Gaussian policy shared by all agents: each acts on its own observation alone.
 
     Attributes:
-        form: of its mean action's network, which `tensors` are the weights of.
+        spec: of its mean action's network, which `tensors` are the weights of.
     """
 
     def __init__(
@@ -187,17 +187,17 @@ class Actor(nn.Module):
         hidden: tuple[int, ...],
         initial_std: float,
         *,
-        form: Form,
+        spec: NetworkSpec,
         normalize: bool = True,
     ) -> None:
         super().__init__()
-        self.form = form
+        self.spec = spec
         fixed = None if normalize else np.arange(observation_size)
-        if isinstance(form, AttentionForm):
-            present = [columns for columns in form.present_columns().values() if columns is not None]
+        if isinstance(spec, AttentionSpec):
+            present = [columns for columns in spec.present_columns().values() if columns is not None]
             fixed = np.concatenate([np.empty(0, np.int64), *present]) if normalize else fixed
-            self.norm = RunningNorm(observation_size, fixed, shared=list(form.columns()[1].values()))
-            self.body = AttentionBody(form, hidden, action_size)
+            self.norm = RunningNorm(observation_size, fixed, shared=list(spec.columns()[1].values()))
+            self.body = AttentionBody(spec, hidden, action_size)
         else:
             self.norm = RunningNorm(observation_size, fixed)
             self.body = mlp((observation_size, *hidden, action_size), Tanh, 0.01)

@@ -28,7 +28,7 @@ from torchrl.objectives.multiagent import QMixerLoss
 
 from hipg_bench.learning.replay import ReplayTrainer
 from hipg_bench.learning.settings import QmixSettings
-from hipg_bench.policies.network import Form
+from hipg_bench.policies.network import NetworkSpec
 
 
 class Values(nn.Module):
@@ -67,7 +67,7 @@ class Trainer(ReplayTrainer):
         """Make worlds and networks; the replay is kept in ``folder``."""
         super().__init__(settings, folder)
         env, self.options = self.env, settings
-        self.form = Form(activation="relu", head="bins", bins=settings.bins)
+        self.spec = NetworkSpec(activation="relu", head="bins", bins=settings.bins)
         values = Values(env.num_agents, env.observation_size, env.action_size, settings.bins, settings.hidden)
         self.body = values.body
         values_of = TensorDictModule(values, ["observation", "acting"], [("agents", "action_value")])

@@ -20,7 +20,7 @@ from hipg_bench.errors import HipgError, ResumeError
 from hipg_bench.learning import checkpoint
 from hipg_bench.learning.networks import RunningNorm
 from hipg_bench.learning.settings import ReplaySettings
-from hipg_bench.policies.network import Form, save_network
+from hipg_bench.policies.network import NetworkSpec, save_network
 from hipg_bench.registry import make
 
 Arrays = dict[str, np.ndarray]
@@ -155,11 +155,11 @@ class ReplayTrainer(abc.ABC):
     """Everything that a run which learns from replayed steps carries from one iteration to the next.
 
     Attributes:
-        form: of the policy's network.
+        spec: of the policy's network.
         body: that network, without normalisation and head.
     """
 
-    form: Form
+    spec: NetworkSpec
     body: MultiAgentMLP
     choice_type: ClassVar[type[np.generic]] = np.float32
     """Of what is stored for every action coordinate."""
@@ -294,7 +294,7 @@ class ReplayTrainer(abc.ABC):
         for k, layer in enumerate(sorted(params.keys(), key=int)):
             for part in ("weight", "bias"):
                 tensors[f"layer{k}.{part}"] = params[layer, part]
-        save_network({name: tensor.detach().numpy() for name, tensor in tensors.items()}, path, self.form)
+        save_network({name: tensor.detach().numpy() for name, tensor in tensors.items()}, path, self.spec)
 
     def save(self, path: Path) -> None:
         """Write a checkpoint, whole or not at all; to be called after every iteration."""
@@ -320,7 +320,7 @@ class ReplayTrainer(abc.ABC):
         self.iteration, self.updates = content["iteration"], content["updates"]
         if self.replay.lost and self.iteration < self.settings.iterations:
             raise ResumeError(
-                f"{path}: the replay beside it is gone (a finished run's is removed): start anew"
+                f"{path}: the replay beside it is gone (a finished run's is removed): start again"
             )
         for name, part in self._parts().items():
             part.load_state_dict(content["parts"][name])

@@ -1,4 +1,4 @@
-"""A training run in a folder: what it leaves behind, and how it goes on after a kill."""
+"""A training run in a folder: what it stores, and how it resumes after it was killed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import mujoco
 import torch
 
 from hipg_bench.errors import HipgError, ResumeError
-from hipg_bench.learning import arithmetic, mappo, trial
+from hipg_bench.learning import mappo, periodic_evaluation, torch_setup
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
 from hipg_bench.learning.trackers import check_services, open_trackers, tag
 from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
@@ -103,8 +103,9 @@ def train(
     audit needs), and TensorBoard events; a kill loses at most one iteration. What MADDPG and QMIX replay
     lies in ``replay`` until they are finished: to take them further than that needs a new folder.
 
-    Every ``eval_every`` steps and at the end the policy is tried (`hipg_bench.learning.trial`). That is
-    for the curve alone: it changes nothing of the run, and the policy that counts is the last one.
+    Every ``eval_every`` steps and at the end the policy is evaluated
+    (`hipg_bench.learning.periodic_evaluation`). That is for the curve alone: it changes nothing of the run,
+    and the policy that counts is the last one.
 
     Args:
         settings: the run; ``steps`` may be larger than before.
@@ -121,7 +122,7 @@ def train(
         HipgError: the learner is built on TorchRL, or tracked by a service, which is not installed.
     """
     check_services(track)
-    arithmetic.prepare()
+    torch_setup.configure()
     with output_folder(out, RECORD, _RESULTS, "training"):
         remove_partial(out)
         _train_alone(settings, out, command, report, track)
@@ -155,7 +156,7 @@ def last_evaluation(out: Path) -> Evaluated | None:
     row, record = rows[-1], read_record(out)
     ends = (float(row["score_low"]), float(row["score_high"])) if row.get("score") else None
     return Evaluated(
-        steps=int(row["steps"]), episodes=trial.num_episodes(record.task),
+        steps=int(row["steps"]), episodes=periodic_evaluation.num_episodes(record.task),
         mean_return=float(row["eval_return"]),
         score=float(row["score"]) if ends else None, score_ci95=ends,
     )  # fmt: skip
@@ -183,7 +184,7 @@ def _train_alone(
     elif isinstance(learner, mappo.Trainer) and learner.settings.initial_policy:
         learner.start_from_policy(Path(learner.settings.initial_policy))
     before = float(rows[-1]["seconds"]) if rows else 0.0
-    worlds = trial.Trial(settings.task, threads=torch.get_num_threads())
+    worlds = periodic_evaluation.PeriodicEvaluation(settings.task, threads=torch.get_num_threads())
     started = time.monotonic()
     with contextlib.ExitStack() as stack:
         done = learner.iteration * settings.num_envs * settings.rollout
@@ -193,7 +194,7 @@ def _train_alone(
         while learner.iteration < settings.iterations:
             log = learner.iterate()
             learner.save_policy(policy)
-            if settings.tries_after(learner.iteration):
+            if settings.evaluates_after(learner.iteration):
                 log |= worlds.play(load_network(policy))
             seconds = round(before + time.monotonic() - started, 1)
             steps = learner.iteration * settings.num_envs * settings.rollout
@@ -227,7 +228,7 @@ def _check_same_task(task: str, out: Path) -> None:
 
 
 def _check_not_lost(out: Path) -> None:
-    """Refuse to begin anew over a run whose checkpoint is gone; a kill loses the first one at most.
+    """Refuse to overwrite a run whose checkpoint is gone; a kill loses the first one at most.
 
     Raises:
         ResumeError: there is such a run.
@@ -278,8 +279,8 @@ def _record(settings: AnySettings, command: str, steps: int, seconds: float) -> 
         "task_fingerprint": spec.fingerprint,
         "settings": settings.model_dump(),
         "evaluation": {
-            "seed": trial.SEED,
-            "episodes": trial.num_episodes(settings.task),
+            "seed": periodic_evaluation.SEED,
+            "episodes": periodic_evaluation.num_episodes(settings.task),
             "exploration": False,
         },
         "env_steps": steps,

@@ -1,4 +1,4 @@
-"""What a training run is told, and the values that are recommended."""
+"""Settings of training runs, and their recommended values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Widths = Annotated[
 
 
 class RunSettings(Params):
-    """What every learner is told: same settings, same result, on one machine.
+    """Settings of every learner. The same settings give the same result on one machine.
 
     Attributes:
         task: task name.
@@ -31,8 +31,8 @@ class RunSettings(Params):
         rollout: T control steps of each in an iteration.
         gamma: discount.
         weights: reward weights that differ from the task's, in training only; logged returns have them.
-        eval_every: environment steps between two trials of the policy, which change nothing of the run; 0
-            tries it at the end only.
+        eval_every: environment steps between two periodic evaluations of the policy, which do not change
+            the run; 0 evaluates it at the end only.
     """
 
     task: str
@@ -49,8 +49,8 @@ class RunSettings(Params):
         """Rollouts in all, the last one whole."""
         return -(-self.steps // (self.num_envs * self.rollout))
 
-    def tries_after(self, iteration: int) -> bool:
-        """Whether the policy is tried after an iteration, counted from 1."""
+    def evaluates_after(self, iteration: int) -> bool:
+        """Whether the policy is evaluated after an iteration, counted from 1."""
         each = self.num_envs * self.rollout
         held, before = ((k * each) // max(self.eval_every, 1) for k in (iteration, iteration - 1))
         return iteration == self.iterations or (self.eval_every > 0 and held > before)
@@ -91,7 +91,7 @@ class Settings(RunSettings):
             rollout, so that runs of different credit rules explore alike; None leaves the weight alone. A
             normal distribution of standard deviation s has 1.42 + log(s).
         initial_policy: policy file whose weights the actor begins with, of any task with the same
-            observations and actions; the critic begins anew. So larger teams go on from what smaller ones
+            observations and actions; the critic is new. So larger teams go on from what smaller ones
             learned.
         actor_rate: the actor's first learning rate; it then follows ``target_kl``.
         critic_rate: the critic's learning rate.
@@ -111,7 +111,7 @@ class Settings(RunSettings):
             and zeros; or ``live``, what a living agent would observe there, as in the authors' code. Matters
             only where the dead are not masked.
         advantage_norm: Psi is normalised over the rollout's live samples, over the whole ``batch``, zeros of
-            the dead included, or anew over every ``minibatch``.
+            the dead included, or again over every ``minibatch``.
         value_clip: how far a value may move in an update before its gradient is cut, in units of
             reward, as in the authors' code; None does not clip.
         normalize_inputs, normalize_returns: running normalisation of what networks see, of value targets.
@@ -246,13 +246,14 @@ SYNONYMS: Mapping[str, str] = {"mappo": "central", "ippo": "local"}
 """Other names that the field uses."""
 
 
-_EPISODES_PER_TRIAL = 1000
-"""A policy is tried each time so many episodes could have been played: 3 % of the time or less."""
+_EPISODES_PER_EVALUATION = 1000
+"""Training episodes between two periodic evaluations, which take 3 % of the time or less."""
 _BY_FAMILY: Mapping[str, dict[str, Any]] = {
-    # what a drone does shows in the team's distances at once: a short trace has less of the others' luck
+    # what a drone does shows in the team's distances at once: a short trace has less of the other agents'
+    # randomness
     "hazard_nav": {
         "steps": 3_000_000, "minibatches": 8, "gamma": 0.9, "gae_lambda": 0.9, "entropy_coef": 0.008,
-        # one way of looking at every point: what an MLP has to learn for each of them anew
+        # one way of looking at every point: what an MLP has to learn for each of them separately
         "attention_groups": ("point", "neighbor"), "actor_hidden": (32, 128),
     },
     # reward is so rare at first that noise would collapse exploration without a strong bonus
@@ -303,7 +304,7 @@ def _parsed(task: str, algorithm: str, values: dict[str, Any]) -> AnySettings:
     if algorithm not in ALGORITHMS:
         near = hint(algorithm, [*ALGORITHMS, *SYNONYMS])
         raise SpecError(f"training {task}: no algorithm {algorithm!r}{near}")
-    every = _EPISODES_PER_TRIAL * task_spec(task).horizon
+    every = _EPISODES_PER_EVALUATION * task_spec(task).horizon
     return parse(
         ALGORITHMS[algorithm],
         {"task": task, "eval_every": every, **values, "algorithm": algorithm},

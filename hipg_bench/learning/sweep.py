@@ -1,4 +1,4 @@
-"""Many training runs from one file, one process per core; stopped, it goes on where it was.
+"""Many training runs from one file, one process per core; a stopped sweep resumes.
 
 A sweep file lists groups of runs::
 

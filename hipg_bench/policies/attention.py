@@ -16,19 +16,19 @@ from jaxtyping import Bool, Float, Int
 
 from hipg_bench.errors import BundleError, hint
 from hipg_bench.layout import Layout
-from hipg_bench.policies.form import (
+from hipg_bench.policies.network_spec import (
     WIDEST,
-    Form,
+    NetworkSpec,
     Shapes,
     Tensors,
     check_head,
     check_observation,
     check_shape,
     check_stack,
+    forward,
     layers,
     normalise,
     stack_names,
-    through,
 )
 from hipg_bench.spec import Params
 
@@ -51,7 +51,7 @@ class Group(Params):
     present: Name | None = None
 
 
-class AttentionForm(Form):
+class AttentionSpec(NetworkSpec):
     """An MLP's, and how an observation falls into tokens.
 
     Attributes:
@@ -72,13 +72,13 @@ class AttentionForm(Form):
     heads: int = pydantic.Field(default=1, ge=1, le=64)
 
     @classmethod
-    def of(cls, layout: Layout, *groups: str, **form: Any) -> AttentionForm:
-        """The form for a task's observation; ``neighbor`` groups the blocks ``neighbor_...``.
+    def of(cls, layout: Layout, *groups: str, **spec: Any) -> AttentionSpec:
+        """The spec for a task's observation; ``neighbor`` groups the blocks ``neighbor_...``.
 
         Args:
             layout: `hipg_bench.make(task).layout.observation`.
             *groups: what the blocks' names begin with.
-            **form: the other fields.
+            **spec: the other fields.
 
         Raises:
             BundleError: no block's name begins so.
@@ -92,7 +92,7 @@ class AttentionForm(Form):
             present = next((name for name in blocks if name.endswith(("_seen", "_there"))), None)
             made[group] = Group(blocks=blocks, present=present)
         observation = tuple((block.name, block.shape) for block in layout.blocks)
-        return cls(observation=observation, groups=made, **form)
+        return cls(observation=observation, groups=made, **spec)
 
     @property
     def observation_size(self) -> int:
@@ -148,40 +148,40 @@ class Attention:
 
     Attributes:
         privileged: it acts on observations.
-        form: what its file declares.
+        spec: what its file declares.
         observation_size, action_size: O and A.
     """
 
     privileged = False
 
-    def __init__(self, tensors: Tensors, form: AttentionForm) -> None:
+    def __init__(self, tensors: Tensors, spec: AttentionSpec) -> None:
         """Take float64 tensors, already checked."""
-        self.form, self._tensors = form, tensors
-        self._own, self._slots = form.columns()
-        self._present = form.present_columns()
+        self.spec, self._tensors = spec, tensors
+        self._own, self._slots = spec.columns()
+        self._present = spec.present_columns()
         self._layers = layers(tensors, "layer")
         self.observation_size = tensors["observation.mean"].size
-        self.action_size = self._layers[-1][1].size // max(form.bins, 1)
+        self.action_size = self._layers[-1][1].size // max(spec.bins, 1)
 
     @staticmethod
-    def check(shapes: Shapes, form: AttentionForm) -> set[str]:
+    def check(shapes: Shapes, spec: AttentionSpec) -> set[str]:
         """Return the names of the tensors it is made of.
 
         Raises:
             BundleError: shapes that do not chain, or groups that are not in the observation.
         """
         width = check_observation(shapes)
-        if form.observation_size != width or len(dict(form.observation)) < len(form.observation):
+        if spec.observation_size != width or len(dict(spec.observation)) < len(spec.observation):
             raise BundleError(
                 f"the observation's blocks must have different names and hold {width} numbers as "
-                f"observation.mean, got {form.observation_size}"
+                f"observation.mean, got {spec.observation_size}"
             )
-        own, slots = form.columns()
+        own, slots = spec.columns()
         size = (*shapes.get("own.bias", ()), 0)[0]
-        if not 0 < size <= WIDEST or size % form.heads:
-            raise BundleError(f"own.bias is ({size},); expected a positive multiple of {form.heads} heads")
+        if not 0 < size <= WIDEST or size % spec.heads:
+            raise BundleError(f"own.bias is ({size},); expected a positive multiple of {spec.heads} heads")
         expected = dict(_embeddings(size, own, slots))
-        if form.pool == "attention":
+        if spec.pool == "attention":
             expected |= {
                 "attention.in_proj_weight": (3 * size, size),
                 "attention.in_proj_bias": (3 * size,),
@@ -192,7 +192,7 @@ class Attention:
             check_shape(shapes, name, shape)
         if "layer0.weight" not in shapes:
             raise BundleError("layer0, from the embeddings to the action, is missing")
-        check_head(form, check_stack(shapes, "layer", 2 * size))
+        check_head(spec, check_stack(shapes, "layer", 2 * size))
         return {"observation.mean", "observation.scale", *expected} | stack_names(shapes, "layer")
 
     def initial_state(self, seed: int, episode_id: Int[np.ndarray, "B"], num_agents: int) -> None:
@@ -208,12 +208,12 @@ class Attention:
             [self._embed(name, seen[..., at]) for name, at in self._slots.items()], axis=2
         )
         there = np.concatenate([self._there(name, observation) for name in self._slots], axis=2)
-        answer = self._ask(own, tokens, there) if self.form.pool == "attention" else _mean(tokens, there)
-        out = through(self._layers, np.concatenate([own, answer], axis=-1), self.form)
-        return self.form.action(out), memory
+        answer = self._ask(own, tokens, there) if self.spec.pool == "attention" else _mean(tokens, there)
+        out = forward(self._layers, np.concatenate([own, answer], axis=-1), self.spec)
+        return self.spec.action(out), memory
 
     def _embed(self, name: str, x: Float[np.ndarray, "*lead entry"]) -> Float[np.ndarray, "*lead D"]:
-        return self.form.activate(x @ self._tensors[f"{name}.weight"].T + self._tensors[f"{name}.bias"])
+        return self.spec.activate(x @ self._tensors[f"{name}.weight"].T + self._tensors[f"{name}.bias"])
 
     def _there(self, group: str, observation: Float[np.ndarray, "B N O"]) -> Bool[np.ndarray, "B N slots"]:
         """Which slots hold somebody."""
@@ -229,7 +229,7 @@ class Attention:
         there: Bool[np.ndarray, "B N slots"],
     ) -> Float[np.ndarray, "B N D"]:
         """The attention's answer to the own embedding."""
-        tensors, heads = self._tensors, self.form.heads
+        tensors, heads = self._tensors, self.spec.heads
         weights = np.split(tensors["attention.in_proj_weight"], 3)
         biases = np.split(tensors["attention.in_proj_bias"], 3)
         query = (own @ weights[0].T + biases[0]).reshape(*own.shape[:2], heads, -1)

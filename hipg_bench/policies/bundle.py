@@ -182,10 +182,10 @@ class Agent:
                 f"agent {self.name!r}: {spec.task} has (O, A) = {expected}, its network {sizes}: train again"
             )
         blocks = tuple((block.name, block.shape) for block in layout.observation.blocks)
-        if isinstance(network, Attention) and network.form.observation != blocks:
+        if isinstance(network, Attention) and network.spec.observation != blocks:
             raise BundleError(
                 f"agent {self.name!r}: {spec.task} shows the blocks {_listed(blocks)}, "
-                f"its network declares {_listed(network.form.observation)}"
+                f"its network declares {_listed(network.spec.observation)}"
             )
         return network
 

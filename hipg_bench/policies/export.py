@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from hipg_bench.errors import BundleError
-from hipg_bench.policies.network import CLIP, Form, GRUForm, save_network
+from hipg_bench.policies.network import CLIP, GRUSpec, NetworkSpec, save_network
 
 _IDLE = (nn.Flatten, nn.Identity, nn.Dropout)
 """Layers that change nothing when an agent acts."""
@@ -48,8 +48,8 @@ def export_sequential(
     Raises:
         BundleError: the network has other layers.
     """
-    tensors, form = _stack(actor, "layer")
-    _save(tensors, form, path, tensors["layer0.weight"].shape[1], normaliser, epsilon)
+    tensors, spec = _stack(actor, "layer")
+    _save(tensors, spec, path, tensors["layer0.weight"].shape[1], normaliser, epsilon)
 
 
 def export_recurrent(
@@ -73,19 +73,19 @@ def export_recurrent(
     Raises:
         BundleError: layers or a unit of another kind.
     """
-    tensors, form = _stack(actor, "layer")
+    tensors, spec = _stack(actor, "layer")
     if encoder is not None:
         encoded, other = _stack(encoder, "encoder", ends_activated=True)
-        if "layer1.weight" in tensors and other.activation != form.activation:
-            raise BundleError(f"one activation is allowed, got {other.activation} and {form.activation}")
+        if "layer1.weight" in tensors and other.activation != spec.activation:
+            raise BundleError(f"one activation is allowed, got {other.activation} and {spec.activation}")
         tensors |= encoded
-        form = form.model_copy(update={"activation": other.activation})
+        spec = spec.model_copy(update={"activation": other.activation})
     own = {name.removesuffix("_l0"): tensor for name, tensor in unit.named_parameters()}
     if set(own) != {"weight_ih", "weight_hh", "bias_ih", "bias_hh"}:
         raise BundleError(f"one layer in one direction with biases is allowed, got {sorted(own)}")
     tensors |= {f"gru.{name}": _array(tensor) for name, tensor in own.items()}
     first = "encoder0.weight" if encoder is not None else "gru.weight_ih"
-    made = GRUForm(**form.model_dump())
+    made = GRUSpec(**spec.model_dump())
     _save(tensors, made, path, tensors[first].shape[1], normaliser, epsilon)
 
 
@@ -117,8 +117,8 @@ def export_sb3(model: Any, path: str | Path) -> None:
 
 def _stack(
     module: nn.Module, name: str, *, ends_activated: bool = False
-) -> tuple[dict[str, np.ndarray], Form]:
-    """The tensors ``<name><k>`` and the form of linear layers with activations between."""
+) -> tuple[dict[str, np.ndarray], NetworkSpec]:
+    """The tensors ``<name><k>`` and the spec of linear layers with activations between."""
     leaves = [one for one in _leaves(module) if not isinstance(one, _IDLE)]
     linear: list[nn.Linear] = [one for one in leaves[::2] if isinstance(one, nn.Linear)]
     between: list[str | None] = [type(one).__name__ for one in leaves[1::2]]
@@ -136,7 +136,7 @@ def _stack(
         tensors[f"{name}{k}.weight"] = _array(one.weight)
         tensors[f"{name}{k}.bias"] = _array(one.state_dict().get("bias", torch.zeros(one.out_features)))
     head = "tanh" if last else "mean"
-    return tensors, Form(activation="relu", head=head) if kinds == {"relu"} else Form(head=head)
+    return tensors, NetworkSpec(activation="relu", head=head) if kinds == {"relu"} else NetworkSpec(head=head)
 
 
 def _leaves(module: nn.Module) -> list[nn.Module]:
@@ -148,7 +148,7 @@ def _leaves(module: nn.Module) -> list[nn.Module]:
 
 def _save(
     tensors: dict[str, np.ndarray],
-    form: Form,
+    spec: NetworkSpec,
     path: str | Path,
     size: int,
     normaliser: Normaliser | None,
@@ -161,7 +161,7 @@ def _save(
         scale = np.sqrt(np.asarray(normaliser.var, np.float64) + epsilon)
         if mean.shape != (size,) or scale.shape != (size,):
             raise BundleError(f"the normaliser is of {mean.shape}, the network takes in ({size},)")
-    save_network(tensors | {"observation.mean": mean, "observation.scale": scale}, Path(path), form)
+    save_network(tensors | {"observation.mean": mean, "observation.scale": scale}, Path(path), spec)
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

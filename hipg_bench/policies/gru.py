@@ -8,24 +8,24 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench.errors import BundleError
-from hipg_bench.policies.form import (
+from hipg_bench.policies.network_spec import (
     WIDEST,
-    Form,
+    NetworkSpec,
     Shapes,
     Tensors,
     check_head,
     check_observation,
     check_shape,
     check_stack,
+    forward,
     layers,
     normalise,
-    on_grid,
+    quantize,
     stack_names,
-    through,
 )
 
 
-class GRUForm(Form):
+class GRUSpec(NetworkSpec):
     """As an MLP's."""
 
     format: ClassVar[str] = "hipg-gru-1"
@@ -39,22 +39,22 @@ class GRU:
 
     Attributes:
         privileged: it acts on observations.
-        form: what its file declares.
+        spec: what its file declares.
         observation_size, action_size, hidden_size: O, A and H, the numbers that an agent remembers.
     """
 
     privileged = False
 
-    def __init__(self, tensors: Tensors, form: GRUForm) -> None:
+    def __init__(self, tensors: Tensors, spec: GRUSpec) -> None:
         """Take float64 tensors, already checked."""
-        self.form, self._tensors = form, tensors
+        self.spec, self._tensors = spec, tensors
         self._encoder, self._layers = layers(tensors, "encoder"), layers(tensors, "layer")
         self.observation_size = tensors["observation.mean"].size
         self.hidden_size = tensors["gru.weight_hh"].shape[1]
-        self.action_size = self._layers[-1][1].size // max(form.bins, 1)
+        self.action_size = self._layers[-1][1].size // max(spec.bins, 1)
 
     @staticmethod
-    def check(shapes: Shapes, form: GRUForm) -> set[str]:
+    def check(shapes: Shapes, spec: GRUSpec) -> set[str]:
         """Return the names of the tensors it is made of.
 
         Raises:
@@ -75,7 +75,7 @@ class GRU:
             check_shape(shapes, name, shape)
         if "layer0.weight" not in shapes:
             raise BundleError("layer0, from the memory to the action, is missing")
-        check_head(form, check_stack(shapes, "layer", hidden))
+        check_head(spec, check_stack(shapes, "layer", hidden))
         stacks = stack_names(shapes, "encoder") | stack_names(shapes, "layer")
         return {"observation.mean", "observation.scale", *unit} | stacks
 
@@ -94,9 +94,9 @@ class GRU:
         """The best action, without exploration noise; in [-reach, reach]."""
         seen = normalise(self._tensors, observation)
         if self._encoder:
-            seen = self.form.activate(through(self._encoder, seen, self.form))
-        after = on_grid(self._remember(seen, memory))
-        return self.form.action(through(self._layers, after, self.form)), after
+            seen = self.spec.activate(forward(self._encoder, seen, self.spec))
+        after = quantize(self._remember(seen, memory))
+        return self.spec.action(forward(self._layers, after, self.spec)), after
 
     def _remember(
         self, seen: Float[np.ndarray, "B N I"], memory: Float[np.ndarray, "B N H"]

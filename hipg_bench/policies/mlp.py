@@ -6,17 +6,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hipg_bench.errors import BundleError
-from hipg_bench.policies.form import (
-    Form,
+from hipg_bench.policies.network_spec import (
+    NetworkSpec,
     Shapes,
     Tensors,
     check_head,
     check_observation,
     check_stack,
+    forward,
     layers,
     normalise,
     stack_names,
-    through,
 )
 
 
@@ -25,26 +25,26 @@ class MLP:
 
     Attributes:
         privileged: it acts on observations.
-        form: what its file declares.
+        spec: what its file declares.
         observation_size, action_size: O and A.
         num_agents: N where every agent has weights of its own, None where all share theirs.
     """
 
     privileged = False
 
-    def __init__(self, tensors: Tensors, form: Form) -> None:
+    def __init__(self, tensors: Tensors, spec: NetworkSpec) -> None:
         """Take float64 tensors, already checked."""
-        self.form, self._tensors = form, tensors
+        self.spec, self._tensors = spec, tensors
         self._layers = layers(tensors, "layer")
         last = self._layers[-1][1]
         self.num_agents = len(last) if last.ndim == 2 else None
         if self.num_agents is not None:
             self._layers = [(weight, bias[:, None]) for weight, bias in self._layers]
         self.observation_size = tensors["observation.mean"].size
-        self.action_size = last.shape[-1] // max(form.bins, 1)
+        self.action_size = last.shape[-1] // max(spec.bins, 1)
 
     @staticmethod
-    def check(shapes: Shapes, form: Form) -> set[str]:
+    def check(shapes: Shapes, spec: NetworkSpec) -> set[str]:
         """Return the names of the tensors it is made of.
 
         Raises:
@@ -54,7 +54,7 @@ class MLP:
         if len(lead) > 1 or "layer0.weight" not in shapes:
             found = shapes.get("layer0.weight"), shapes.get("layer0.bias")
             raise BundleError(f"layer0 is {found[0]}, {found[1]}; expected (out, O), (out,)")
-        check_head(form, check_stack(shapes, "layer", check_observation(shapes), lead))
+        check_head(spec, check_stack(shapes, "layer", check_observation(shapes), lead))
         return {"observation.mean", "observation.scale"} | stack_names(shapes, "layer")
 
     def initial_state(self, seed: int, episode_id: Int[np.ndarray, "B"], num_agents: int) -> None:
@@ -72,6 +72,6 @@ class MLP:
         """The best action, without exploration noise; in [-reach, reach]."""
         hidden = normalise(self._tensors, observation)
         if self.num_agents is None:
-            return self.form.action(through(self._layers, hidden, self.form)), memory
-        by_agent = through(self._layers, hidden.swapaxes(0, 1), self.form)
-        return self.form.action(by_agent.swapaxes(0, 1)), memory
+            return self.spec.action(forward(self._layers, hidden, self.spec)), memory
+        by_agent = forward(self._layers, hidden.swapaxes(0, 1), self.spec)
+        return self.spec.action(by_agent.swapaxes(0, 1)), memory

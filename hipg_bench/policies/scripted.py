@@ -1,7 +1,7 @@
-"""Scripted experts: what a team that knows everything does, and the same team blind to the hazard.
+"""Scripted experts: what a team that knows everything does, and the same team unaware of the hazard.
 
 They act on the joint state, so they are never ranked. They fix the reference anchor of a task, and
-the gap between the aware and the blind variant is its hazard leverage.
+the gap between the aware and the hazard-unaware expert is its hazard sensitivity.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _relay(
     alive: Bool[np.ndarray, "B N"],
     blind: bool,
 ) -> Places:
-    """Form an evenly spaced chain between the terminals: straight if blind, else around the hazard."""
+    """Form an evenly spaced chain between the terminals, around the hazard unless ``blind`` to it."""
     position = layout.state.view(state, "position")
     terminal = layout.state.view(state, "terminal_position")
     hazard = layout.state.view(state, "hazard_position")

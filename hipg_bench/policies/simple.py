@@ -1,4 +1,4 @@
-"""Policies without eyes: nothing, chance, and open loops. A good task gives none of them a score."""
+"""Open-loop baselines: no action, random actions, and fixed sequences. On a good task they score about 0."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BLOCK = 64
 
 
 class Zero:
-    """Does nothing: the null probe."""
+    """No-op baseline."""
 
     privileged = False
 

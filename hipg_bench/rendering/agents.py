@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from hipg_bench.families.scene import VISUAL_GROUP
 from hipg_bench.rendering import palette
-from hipg_bench.rendering.motion import Footage
+from hipg_bench.rendering.motion import Trajectory
 
 _AGENT = re.compile(r"(?:drone|walker|particle)(\d+)/")
 """How names of an agent's parts begin."""
@@ -34,7 +34,7 @@ _FADE = 0.35
 """Seconds from a death until the wreck is dark."""
 
 
-class Cast:
+class AgentVisuals:
     """The agents of a world, to be dressed for a time.
 
     Attributes:
@@ -42,15 +42,15 @@ class Cast:
         root: (N,) body that stands for each agent.
     """
 
-    def __init__(self, footage: Footage) -> None:
-        self._footage = footage
-        self._model = footage.model
-        self.colour = palette.team(footage.num_agents)
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._trajectory = trajectory
+        self._model = trajectory.model
+        self.colour = palette.team(trajectory.num_agents)
         owner = [_owner(self._model, mujoco.mjtObj.mjOBJ_BODY, k) for k in range(self._model.nbody)]
-        self.root = np.array([owner.index(i) for i in range(footage.num_agents)])
+        self.root = np.array([owner.index(i) for i in range(trajectory.num_agents)])
         self._geoms = [
             np.flatnonzero([owner[b] == i for b in self._model.geom_bodyid])
-            for i in range(footage.num_agents)
+            for i in range(trajectory.num_agents)
         ]
         self._rgba = _resting_colour(self._model)
         tinted = np.array(
@@ -68,17 +68,17 @@ class Cast:
 
     def place(self, agent: int) -> Float[np.ndarray, "3"]:
         """Where an agent is now, m."""
-        return self._footage.data.xpos[self.root[agent]].copy()
+        return self._trajectory.data.xpos[self.root[agent]].copy()
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
         """Of the team, m."""
-        return self._footage.data.xpos[self.root].mean(axis=0)
+        return self._trajectory.data.xpos[self.root].mean(axis=0)
 
-    def dress(self, time: float) -> None:
-        """Colour the agents, and lean the drones, as of the time that the footage shows."""
-        for agent in range(self._footage.num_agents):
-            dead_for = time - float(self._footage.lifetime[agent])
+    def update(self, time: float) -> None:
+        """Colour the agents, and lean the drones, as of the time that the trajectory shows."""
+        for agent in range(self._trajectory.num_agents):
+            dead_for = time - float(self._trajectory.lifetime[agent])
             self._paint(agent, dead_for)
             if self._flies:
                 self._lean(agent, time, dead_for)
@@ -102,7 +102,7 @@ class Cast:
 
     def _lean(self, agent: int, time: float, dead_for: float) -> None:
         """Turn what is drawn of a drone about its centre; wrecks tumble and settle on the floor."""
-        data, model = self._footage.data, self._model
+        data, model = self._trajectory.data, self._model
         geoms = self._geoms[agent]
         geoms = geoms[model.geom_group[geoms] == VISUAL_GROUP]
         centre = data.xpos[self.root[agent]]
@@ -124,11 +124,13 @@ class Cast:
 
     def _attitude(self, agent: int, time: float) -> Float[np.ndarray, "3 3"]:
         """The lean of a real quadcopter with this acceleration and this drag."""
-        footage = self._footage
+        trajectory = self._trajectory
         body = self.root[agent]
-        push = np.array([np.interp(time, footage.time, footage.acceleration[:, body, k]) for k in range(2)])
-        first = footage.model.body_dofadr[body]
-        push += footage.data.qvel[first : first + 2] * footage.model.dof_damping[first]
+        push = np.array(
+            [np.interp(time, trajectory.time, trajectory.acceleration[:, body, k]) for k in range(2)]
+        )
+        first = trajectory.model.body_dofadr[body]
+        push += trajectory.data.qvel[first : first + 2] * trajectory.model.dof_damping[first]
         angle = min(_STEEPEST, float(np.arctan2(np.linalg.norm(push), _GRAVITY)))
         return _tilt(push, angle)
 

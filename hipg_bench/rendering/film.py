@@ -118,7 +118,9 @@ def record(
         )
     chosen = backend or gl.working_backend()
     if chosen is None:
-        raise RenderError(f"no OpenGL works here, neither {' nor '.join(gl.BACKENDS)}: run\n  {gl.MEND}")
+        raise RenderError(
+            f"no OpenGL works here, neither {' nor '.join(gl.BACKENDS)}: run\n  {gl.INSTALL_COMMAND}"
+        )
     with replacing(out) as temporary, tempfile.TemporaryDirectory(prefix="hipg-film-") as folder:
         np.save(Path(folder) / "rows.npy", np.asarray(rows, np.float64), allow_pickle=False)
         job = Job(
@@ -186,32 +188,32 @@ def _frames(job: Job, rows: Float[np.ndarray, "K R"]) -> Iterator[tuple[bytes, i
     """Every frame's pixels, with the number of frames of the film."""
     # graphics are touched here and in the child only
     from hipg_bench.rendering.hud import Caption, Hud, Reading
-    from hipg_bench.rendering.motion import Footage
-    from hipg_bench.rendering.painter import Painter, View, views
-    from hipg_bench.rendering.scene import Stage
+    from hipg_bench.rendering.motion import Trajectory
+    from hipg_bench.rendering.renderer import Renderer, View, views
+    from hipg_bench.rendering.scene import Scene
 
-    footage = Footage(job.spec, rows)
-    stage = Stage(footage)
+    trajectory = Trajectory(job.spec, rows)
+    scene = Scene(trajectory)
     duration, pace = job.spec.horizon * job.spec.control_step, pace_of(job.spec)
-    caption = Caption(job.spec.task, job.agent, stage.legend, pace, duration, stage.cast.colour)
+    caption = Caption(job.spec.task, job.agent, scene.legend, pace, duration, scene.visuals.colour)
     hud = Hud(caption, job.width, job.height)
-    times = moments(footage.time, pace, job.fps)
+    times = moments(trajectory.time, pace, job.fps)
     held = round(_CARD * job.fps)
     total = len(times) + held
 
     def painted(composed: Iterator[View]) -> Iterator[tuple[View, np.ndarray]]:
-        with Painter(footage.model, job.width, job.height) as painter:
+        with Renderer(trajectory.model, job.width, job.height) as renderer:
             for view in composed:
-                yield view, painter.paint(view.scene)
+                yield view, renderer.render(view.mjv_scene)
 
     picture = hud.blank
     # while a view is painted, the next one is composed and the one before is written on and encoded
-    for view, frame in ahead(painted(ahead(views(stage, times.tolist(), job.height)))):
-        now = footage.remembered(view.time)
+    for view, frame in ahead(painted(ahead(views(scene, times.tolist(), job.height)))):
+        now = trajectory.remembered(view.time)
         reading = Reading(view.time, float(now["return"][0]), now["health"], view.status)
         picture = hud.write(frame, view.camera, view.labels, reading)
         yield picture.tobytes(), total
-    headline, lines = _ending(job, footage.remembered(footage.time[-1]))
+    headline, lines = _ending(job, trajectory.remembered(trajectory.time[-1]))
     for k in range(held):
         share = min(1.0, (k + 1) / max(1, round(_FADE_IN * job.fps)))
         yield hud.end_card(picture, share, headline, lines).tobytes(), total

@@ -25,7 +25,7 @@ NAMES = (
     "enabled", "on", "true", "1",
 )  # fmt: skip
 """What ``MUJOCO_GL`` may be: with anything else MuJoCo cannot be imported."""
-MEND = "apt-get install -y libegl1 libgl1-mesa-dri libosmesa6"
+INSTALL_COMMAND = "apt-get install -y libegl1 libgl1-mesa-dri libosmesa6"
 """What to run on Debian or Ubuntu when no backend works."""
 
 _PATIENCE = 60.0
@@ -107,7 +107,7 @@ def last_words(stderr: str, code: int) -> str:
 def advice(why: str) -> str:
     """What to install, where a child process failed because OpenGL is missing; else nothing."""
     missing = any(word in why for word in ("OpenGL", "EGL", "OSMesa", "libGL", "GLError", "GLFW"))
-    return f"\nIf OpenGL is missing: {MEND}" if missing else ""
+    return f"\nIf OpenGL is missing: {INSTALL_COMMAND}" if missing else ""
 
 
 @functools.cache

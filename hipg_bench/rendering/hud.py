@@ -13,9 +13,9 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from hipg_bench.rendering import palette
-from hipg_bench.rendering.brush import Label
 from hipg_bench.rendering.camera import Camera
 from hipg_bench.rendering.look import WHITE, Status
+from hipg_bench.rendering.painter import Label
 
 _REFERENCE_HEIGHT = 720
 """Sizes below are pixels of a picture of this height; all scale with it."""

@@ -133,7 +133,8 @@ class _Child:
         backend = "glfw" if job.mode == "human" else gl.working_backend()
         if backend is None:
             raise RenderError(
-                f"{job.spec.task}: no OpenGL works, neither {' nor '.join(gl.BACKENDS)}: run\n  {gl.MEND}"
+                f"{job.spec.task}: no OpenGL works, neither {' nor '.join(gl.BACKENDS)}: run\n"
+                f"  {gl.INSTALL_COMMAND}"
             )
         self._where = f"{job.spec.task}: {backend}"
         self.parent = os.getpid()
@@ -201,28 +202,28 @@ def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
     """Answer each message with a picture, written on as in films."""
     # graphics are touched here and in the child only
     from hipg_bench.rendering.hud import Caption, Hud, Reading
-    from hipg_bench.rendering.motion import Footage
-    from hipg_bench.rendering.painter import Painter, views
-    from hipg_bench.rendering.scene import Stage
+    from hipg_bench.rendering.motion import Trajectory
+    from hipg_bench.rendering.renderer import Renderer, views
+    from hipg_bench.rendering.scene import Scene
 
     messages = _messages()
     first = next(messages)
-    footage = Footage(spec, first[:1])
-    stage = Stage(footage)
+    trajectory = Trajectory(spec, first[:1])
+    scene = Scene(trajectory)
     duration = spec.horizon * spec.control_step
-    hud = Hud(Caption(spec.task, "", stage.legend, 1.0, duration, stage.cast.colour), *SIZE)
+    hud = Hud(Caption(spec.task, "", scene.legend, 1.0, duration, scene.visuals.colour), *SIZE)
 
     def latest() -> Iterator[float]:
         for rows in itertools.chain([first[1:]], messages):
             for row in rows:
-                footage.append(row)
-            yield float(footage.time[-1])
+                trajectory.append(row)
+            yield float(trajectory.time[-1])
 
-    with Painter(footage.model, *SIZE) as painter:
-        for view in views(stage, latest(), SIZE[1]):
-            now = footage.remembered(view.time)
+    with Renderer(trajectory.model, *SIZE) as renderer:
+        for view in views(scene, latest(), SIZE[1]):
+            now = trajectory.remembered(view.time)
             reading = Reading(view.time, float(now["return"][0]), now["health"], view.status)
-            frame = painter.paint(view.scene)
+            frame = renderer.render(view.mjv_scene)
             out.write(hud.write(frame, view.camera, view.labels, reading).tobytes())
             out.flush()
 

@@ -8,10 +8,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from hipg_bench.rendering import palette
-from hipg_bench.rendering.agents import Cast
-from hipg_bench.rendering.brush import Brush
+from hipg_bench.rendering.agents import AgentVisuals
 from hipg_bench.rendering.camera import Camera
-from hipg_bench.rendering.motion import Footage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.painter import Painter
 
 WHITE = (0.93, 0.95, 1.0)
 """Of neutral words and marks."""
@@ -46,18 +46,18 @@ class Look(Protocol):
     body_size: float
     reach: float
 
-    def __init__(self, footage: Footage, cast: Cast) -> None: ...
+    def __init__(self, trajectory: Trajectory, visuals: AgentVisuals) -> None: ...
 
-    def dress(self, time: float) -> None:
-        """Colour what is in the model, as of the time that the footage shows."""
+    def update(self, time: float) -> None:
+        """Colour what is in the model, as of the time that the trajectory shows."""
         ...
 
     def label_place(self, agent: int) -> np.ndarray:
         """Where an agent's number is written, m."""
         ...
 
-    def decorate(self, brush: Brush, time: float) -> list[Status]:
-        """Draw what matters at the time that the footage shows; return what to say about it."""
+    def decorate(self, painter: Painter, time: float) -> list[Status]:
+        """Draw what matters at the time that the trajectory shows; return what to say about it."""
         ...
 
     def camera(self, time: float) -> Camera:
@@ -65,28 +65,32 @@ class Look(Protocol):
         ...
 
 
-def mark_agents(brush: Brush, look: Look, cast: Cast, footage: Footage, time: float) -> None:
+def mark_agents(
+    painter: Painter, look: Look, visuals: AgentVisuals, trajectory: Trajectory, time: float
+) -> None:
     """Number everyone; a flash, smoke and a scorched spot for the dead."""
-    for agent in range(footage.num_agents):
-        place = cast.place(agent)
+    for agent in range(trajectory.num_agents):
+        place = visuals.place(agent)
         beside = look.label_place(agent)
-        dead_for = time - float(footage.lifetime[agent])
+        dead_for = time - float(trajectory.lifetime[agent])
         if dead_for < 0:
-            brush.write(beside, str(agent + 1), palette.blend(cast.colour[agent], WHITE, 0.35))
+            painter.write(beside, str(agent + 1), palette.blend(visuals.colour[agent], WHITE, 0.35))
             continue
         text = f"{agent + 1} \N{MULTIPLICATION X}"
-        brush.write(beside, text, palette.blend(palette.DANGER, WHITE, 0.3), strong=True)
-        _death(brush, agent, place, look.body_size, dead_for, time)
+        painter.write(beside, text, palette.blend(palette.DANGER, WHITE, 0.3), strong=True)
+        _death(painter, agent, place, look.body_size, dead_for, time)
 
 
-def _death(brush: Brush, agent: int, place: np.ndarray, size: float, dead_for: float, time: float) -> None:
+def _death(
+    painter: Painter, agent: int, place: np.ndarray, size: float, dead_for: float, time: float
+) -> None:
     flash = dead_for / 0.45
     if flash < 1:
         alpha = 0.55 * (1 - flash) ** 1.5
-        brush.ball(place, size * (0.6 + 2.0 * flash), (1.0, 0.55, 0.25), alpha, glow=1.0)
+        painter.ball(place, size * (0.6 + 2.0 * flash), (1.0, 0.55, 0.25), alpha, glow=1.0)
     if place[2] < 5 * size:
         spot = (place[0], place[1], 0.002)
-        brush.disc(spot, 1.7 * size, (0.01, 0.01, 0.01), 0.55 * min(1.0, dead_for), glow=0.0)
+        painter.disc(spot, 1.7 * size, (0.01, 0.01, 0.01), 0.55 * min(1.0, dead_for), glow=0.0)
     # puffs rise, widen and thin, and stop after some seconds
     strength = float(np.clip(dead_for / 0.3, 0, 1) * np.clip((4.0 - dead_for) / 2.0, 0, 1))
     for k in range(5 if strength > 0 else 0):
@@ -94,4 +98,4 @@ def _death(brush: Brush, agent: int, place: np.ndarray, size: float, dead_for: f
         sway = 0.5 * size * np.array([np.sin(2.1 * k + 5 * age), np.cos(1.7 * k + 4 * age), 0.0])
         centre = place + age * (sway + np.array([0.0, 0.0, 5.0 * size]))
         alpha = 0.30 * strength * (1 - age)
-        brush.ball(centre, size * (0.25 + 0.6 * age), (0.32, 0.32, 0.34), alpha, glow=0.2)
+        painter.ball(centre, size * (0.25 + 0.6 * age), (0.32, 0.32, 0.34), alpha, glow=0.2)

@@ -11,8 +11,8 @@ import numpy as np
 from dm_control.mujoco import Physics, wrapper
 from jaxtyping import Float
 
-from hipg_bench.rendering.motion import Footage
-from hipg_bench.rendering.scene import Stage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.scene import Scene
 from hipg_bench.spec import TaskSpec
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -29,20 +29,20 @@ class Mirror:
         Raises:
             RenderError: nobody has said how the family looks.
         """
-        self._stage = Stage(Footage(spec, row[None]))
-        self._physics = Physics(wrapper.MjData(self._stage.footage.data))
+        self._scene = Scene(Trajectory(spec, row[None]))
+        self._physics = Physics(wrapper.MjData(self._scene.trajectory.data))
         self._show()
 
     def physics(self, row: Float[np.ndarray, "R"]) -> Physics:
         """The physics, put at ``row``: always the same object, all derived quantities computed."""
-        if not np.array_equal(row, self._stage.footage.rows[0]):
-            self._stage.footage.load(row[None])
+        if not np.array_equal(row, self._scene.trajectory.rows[0]):
+            self._scene.trajectory.load(row[None])
             self._show()
         return self._physics
 
     def _show(self) -> None:
-        footage = self._stage.footage
-        self._stage.dress(float(footage.time[0]) + _BURNT)
+        trajectory = self._scene.trajectory
+        self._scene.update(float(trajectory.time[0]) + _BURNT)
         # films interpolate, and lean drones into their thrust; here every number is the world's own
-        mujoco.mj_setState(footage.model, footage.data, footage.rows[0], _STATE)
-        mujoco.mj_forward(footage.model, footage.data)
+        mujoco.mj_setState(trajectory.model, trajectory.data, trajectory.rows[0], _STATE)
+        mujoco.mj_forward(trajectory.model, trajectory.data)

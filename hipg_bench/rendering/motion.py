@@ -27,7 +27,7 @@ _LEAN_WINDOW = 0.15
 """Standard deviation of the smoothing of accelerations that drones lean into, s."""
 
 
-class Footage:
+class Trajectory:
     """Saved rows of one world, and the world itself with everything a camera sees.
 
     Attributes:

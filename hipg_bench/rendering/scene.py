@@ -11,13 +11,13 @@ import mujoco
 
 from hipg_bench.errors import RenderError, hint
 from hipg_bench.rendering import drones, walkers
-from hipg_bench.rendering.agents import Cast
-from hipg_bench.rendering.brush import Brush, Label
+from hipg_bench.rendering.agents import AgentVisuals
 from hipg_bench.rendering.camera import Camera
 from hipg_bench.rendering.look import Look, Status, mark_agents
-from hipg_bench.rendering.motion import Footage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.painter import Label, Painter
 
-LOOKS: Mapping[str, Callable[[Footage, Cast], Look]] = {
+LOOKS: Mapping[str, Callable[[Trajectory, AgentVisuals], Look]] = {
     "hazard_nav": drones.Navigation,
     "hazard_comm": drones.Communication,
     "paper_nav": drones.Navigation,
@@ -27,46 +27,46 @@ LOOKS: Mapping[str, Callable[[Footage, Cast], Look]] = {
 """Family to how it is shown."""
 
 
-class Stage:
-    """One world, ready to be drawn at any time of its footage.
+class Scene:
+    """One world, ready to be drawn at any time of its trajectory.
 
     Attributes:
-        footage: its rows.
-        cast: its agents.
+        trajectory: its rows.
+        visuals: its agents.
         legend: what the colours mean, one line.
         travels: whether the team leaves the place where it began.
     """
 
-    def __init__(self, footage: Footage) -> None:
+    def __init__(self, trajectory: Trajectory) -> None:
         """Prepare the agents and the family's look.
 
         Raises:
             RenderError: nobody has said how the family looks.
         """
-        family = footage.spec.family
+        family = trajectory.spec.family
         if family not in LOOKS:
-            raise RenderError(f"{footage.spec.task}: no look for family {family!r}{hint(family, LOOKS)}")
-        self.footage = footage
-        self.cast = Cast(footage)
-        self._look = LOOKS[family](footage, self.cast)
+            raise RenderError(f"{trajectory.spec.task}: no look for family {family!r}{hint(family, LOOKS)}")
+        self.trajectory = trajectory
+        self.visuals = AgentVisuals(trajectory)
+        self._look = LOOKS[family](trajectory, self.visuals)
         self.legend = self._look.legend
         self.travels = self._look.travels
         # shadows are computed within a square around the camera's target
-        footage.model.vis.map.shadowclip = self._look.reach / footage.model.stat.extent
+        trajectory.model.vis.map.shadowclip = self._look.reach / trajectory.model.stat.extent
 
-    def dress(self, time: float) -> None:
+    def update(self, time: float) -> None:
         """Put the model's data at a time, agents coloured."""
-        self.footage.show(time)
-        self.cast.dress(time)
-        self._look.dress(time)
+        self.trajectory.show(time)
+        self.visuals.update(time)
+        self._look.update(time)
 
     def decorate(
-        self, scene: mujoco.MjvScene, time: float, height: int = 720
+        self, mjv_scene: mujoco.MjvScene, time: float, height: int = 720
     ) -> tuple[list[Label], list[Status]]:
         """Add to a scene what is in no model, for so many pixels; return what to write on the picture."""
-        brush = Brush(scene, self.camera(time), height)
-        mark_agents(brush, self._look, self.cast, self.footage, time)
-        return brush.labels, self._look.decorate(brush, time)
+        painter = Painter(mjv_scene, self.camera(time), height)
+        mark_agents(painter, self._look, self.visuals, self.trajectory, time)
+        return painter.labels, self._look.decorate(painter, time)
 
     def camera(self, time: float) -> Camera:
         """The view at a time."""

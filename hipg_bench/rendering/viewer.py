@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hipg_bench.errors import RenderError
-from hipg_bench.rendering.motion import Footage
-from hipg_bench.rendering.scene import Stage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.scene import Scene
 from hipg_bench.spec import TaskSpec
 
 _FRAME = 1 / 60
@@ -51,48 +51,48 @@ def watch(spec: TaskSpec, rows: Iterator[Float[np.ndarray, "R"]], *, speed: floa
         RenderError: no display, or no look for the task's family.
     """
     check_display()
-    footage = Footage(spec, next(rows)[None])
-    stage = Stage(footage)
-    stage.dress(0.0)
+    trajectory = Trajectory(spec, next(rows)[None])
+    scene = Scene(trajectory)
+    scene.update(0.0)
     with mujoco.viewer.launch_passive(
-        footage.model, footage.data, show_left_ui=False, show_right_ui=False
+        trajectory.model, trajectory.data, show_left_ui=False, show_right_ui=False
     ) as window:
-        camera = stage.camera(0.0)
+        camera = scene.camera(0.0)
         window.cam.lookat[:] = camera.target
         window.cam.distance, window.cam.azimuth = camera.distance, camera.azimuth
         window.cam.elevation = camera.elevation
         due = time.monotonic()
         for row in rows:
-            footage.append(row)
-            if len(footage.rows) == 1:
+            trajectory.append(row)
+            if len(trajectory.rows) == 1:
                 due += _PAUSE
                 continue
-            start, end = (float(moment) for moment in footage.time[-2:])
+            start, end = (float(moment) for moment in trajectory.time[-2:])
             pictures = max(1, round((end - start) / speed / _FRAME))
             for k in range(1, pictures + 1):
                 if not window.is_running():
                     return
-                _draw(window, stage, start + (end - start) * k / pictures)
+                _draw(window, scene, start + (end - start) * k / pictures)
                 due += (end - start) / speed / pictures
                 time.sleep(max(0.0, due - time.monotonic()))
             due = max(due, time.monotonic() - 2 * _FRAME)  # a slow machine plays slowly, it never skips
 
 
-def _draw(window: mujoco.viewer.Handle, stage: Stage, moment: float) -> None:
+def _draw(window: mujoco.viewer.Handle, scene: Scene, moment: float) -> None:
     with window.lock():
-        before = stage.cast.middle
-        stage.dress(moment)
-        if stage.travels:
-            window.cam.lookat[:2] += (stage.cast.middle - before)[:2]
-        scene = window.user_scn
-        scene.ngeom = 0
-        _, status = stage.decorate(scene, moment)
-    now = stage.footage.remembered(moment)
+        before = scene.visuals.middle
+        scene.update(moment)
+        if scene.travels:
+            window.cam.lookat[:2] += (scene.visuals.middle - before)[:2]
+        mjv_scene = window.user_scn
+        mjv_scene.ngeom = 0
+        _, status = scene.decorate(mjv_scene, moment)
+    now = scene.trajectory.remembered(moment)
     alive = int((now["health"] > 0).sum())
     words = {
         "time": f"{moment:.1f} s",
         "return": f"{float(now['return'][0]):.1f}",
-        "alive": f"{alive} of {stage.footage.num_agents}",
+        "alive": f"{alive} of {scene.trajectory.num_agents}",
         **{line.text: "" for line in status},
     }
     window.set_texts((None, None, "\n".join(words), "\n".join(words.values())))

@@ -15,9 +15,9 @@ BACKENDS: Mapping[str, Backend] = {
 """By name, the best first; the last one locks nothing."""
 
 
-def trials() -> Mapping[str, probe.Trial]:
+def probe_all() -> Mapping[str, probe.ProbeResult]:
     """What each sandbox was worth when tried."""
-    return {name: probe.trial(backend) for name, backend in BACKENDS.items() if name != NONE}
+    return {name: probe.probe_backend(backend) for name, backend in BACKENDS.items() if name != NONE}
 
 
 def sandbox() -> str:
@@ -30,7 +30,7 @@ def sandbox() -> str:
     for name, backend in BACKENDS.items():
         if name == NONE:
             continue
-        found = probe.trial(backend)
+        found = probe.probe_backend(backend)
         if found.works:
             return name
         trouble.append(f"  {name}: {found}")

@@ -26,7 +26,7 @@ _SECONDS = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Trial:
+class ProbeResult:
     """How a sandbox did.
 
     Attributes:
@@ -53,14 +53,14 @@ class Trial:
 
 
 @functools.cache
-def trial(backend: Backend) -> Trial:
+def probe_backend(backend: Backend) -> ProbeResult:
     """Try a sandbox; a process asks once."""
     started = time.monotonic()
     try:
         through = _attempt(backend)
     except (AgentFailure, HostFailure, SandboxError) as failure:
-        return Trial(trouble=str(failure), seconds=time.monotonic() - started)
-    return Trial(through, seconds=time.monotonic() - started)
+        return ProbeResult(trouble=str(failure), seconds=time.monotonic() - started)
+    return ProbeResult(through, seconds=time.monotonic() - started)
 
 
 def _attempt(backend: Backend) -> tuple[str, ...]:

@@ -200,7 +200,7 @@ def _declared(reader: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 def _manifest(reader: zipfile.ZipFile, entries: Mapping[str, zipfile.ZipInfo]) -> Manifest:
     """The manifest, which names just the files that are there."""
     if MANIFEST not in entries or entries[MANIFEST].file_size > _MOST_MANIFEST:
-        raise BundleError(f"a {MANIFEST} of at most {_MOST_MANIFEST} bytes must be in it: pack it anew")
+        raise BundleError(f"a {MANIFEST} of at most {_MOST_MANIFEST} bytes must be in it: pack it again")
     with reader.open(entries[MANIFEST]) as file:
         values = json.loads(file.read(_MOST_MANIFEST + 1))
     manifest = parse(Manifest, values if isinstance(values, dict) else {}, MANIFEST)

@@ -11,7 +11,7 @@ from hipg_bench.policies.bundle import Agent, bundle_files
 from hipg_bench.policies.card import read_card
 from hipg_bench.sandbox import choice
 from hipg_bench.submissions.findings import Finding, error, fine
-from hipg_bench.submissions.paperwork import (
+from hipg_bench.submissions.metadata_checks import (
     SUITE_TAG,
     look_at_card,
     look_at_files,

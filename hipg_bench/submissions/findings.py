@@ -26,7 +26,7 @@ class Finding:
 
 
 def error(where: str, what: str, remedy: str = "") -> Finding:
-    """Something that must be mended."""
+    """Something that must be fixed."""
     return Finding("error", where, what, remedy)
 
 

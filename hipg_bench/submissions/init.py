@@ -16,7 +16,7 @@ from hipg_bench.evaluation.seeds import SUITE
 from hipg_bench.paths import replacing, write_text
 from hipg_bench.policies.card import Training
 from hipg_bench.policies.trained import POLICY, RECORD, Trained, find_agent, read_record
-from hipg_bench.submissions.paperwork import SUITE_TAG, TODO
+from hipg_bench.submissions.metadata_checks import SUITE_TAG, TODO
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]{0,63}")

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from hipg_bench.errors import AgentFailure, BundleError, HostFailure
 from hipg_bench.evaluation.decentralised import verify
-from hipg_bench.evaluation.episodes import Plan, Row
+from hipg_bench.evaluation.episodes import EvaluationJob, Row
 from hipg_bench.evaluation.failures import OK, close
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.policies.policy import Policy
@@ -19,7 +19,7 @@ from hipg_bench.sandbox.budget import PROTOCOL
 from hipg_bench.spec import TaskSpec
 from hipg_bench.submissions.findings import Finding, advice, error, fine
 
-_PLAN = Plan(threads=1)
+_JOB = EvaluationJob(threads=1)
 """Public worlds, in which nobody is scored for the board."""
 _WORLDS = [0, 1, 2, 3]
 _LITTLE = 0.05
@@ -95,8 +95,8 @@ def try_task(agent: Agent, spec: TaskSpec, train_seed: int) -> Iterator[Finding]
     where = f"{spec.task}, seed {train_seed}"
     try:
         heard = Heard(agent.policy(spec, train_seed))
-        (alone,) = _PLAN.play(spec, heard, _WORLDS[:1])
-        together = _PLAN.play(spec, heard, _WORLDS) if alone["status"] == OK else []
+        (alone,) = _JOB.play(spec, heard, _WORLDS[:1])
+        together = _JOB.play(spec, heard, _WORLDS) if alone["status"] == OK else []
     except BundleError as trouble:
         yield error(where, str(trouble), _first_that_fits(str(trouble)) or _reminder(agent, spec))
         return
@@ -124,7 +124,7 @@ def try_weights(agent: Agent, spec: TaskSpec, train_seed: int) -> Iterator[Findi
 
 def try_alone(agent: Agent, spec: TaskSpec, train_seed: int) -> Iterator[Finding]:
     """Whether agents act on their own observations alone, as the card says."""
-    verdict = verify(spec, agent.policy(spec, train_seed), _PLAN, _WORLDS)
+    verdict = verify(spec, agent.policy(spec, train_seed), _JOB, _WORLDS)
     if verdict.decentralised:
         yield fine(spec.task, str(verdict))
     else:

@@ -171,7 +171,7 @@ def mamujoco() -> Contender:
 
 
 def hipg_pettingzoo(task: str) -> Contender:
-    """Our PettingZoo face."""
+    """Our PettingZoo adapter."""
     import hipg_bench
     from hipg_bench.adapters.pettingzoo import parallel_env
 
@@ -183,11 +183,11 @@ def hipg_pettingzoo(task: str) -> Contender:
 
 def hipg_mappo(task: str) -> Contender:
     """Whole training iterations of our MAPPO, min-health crediting included."""
-    from hipg_bench.learning import arithmetic
+    from hipg_bench.learning import torch_setup
     from hipg_bench.learning.mappo import Trainer
     from hipg_bench.learning.settings import Settings, recommended
 
-    arithmetic.prepare()  # as `hipg-bench train` does
+    torch_setup.configure()  # as `hipg-bench train` does
     settings = recommended(task)
     if not isinstance(settings, Settings):
         raise TypeError(f"MAPPO's settings are compared, got {settings!r}")
@@ -205,7 +205,7 @@ def hipg_mappo(task: str) -> Contender:
 
 
 def torchrl_mappo(task: str) -> Contender:
-    """TorchRL's collector, GAE and clipped PPO loss on our task, through our TorchRL face."""
+    """TorchRL's collector, GAE and clipped PPO loss on our task, through our TorchRL adapter."""
     from torchrl_mappo import Mappo
 
     from hipg_bench.learning.settings import Settings, recommended

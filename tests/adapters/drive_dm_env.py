@@ -1,7 +1,7 @@
-"""Drives the dm_env face: a list entry per agent, and the team as one agent."""
+"""Drives the dm_env adapter: a list entry per agent, and the team as one agent."""
 
 import numpy as np
-from faces import Seen
+from drivers import Seen
 
 from hipg_bench.adapters.dm_env import load
 from hipg_bench.registry import family_of

@@ -1,8 +1,8 @@
-"""Drives the Gymnasium faces: one environment, and vectors of one world with each way to go on."""
+"""Drives the Gymnasium adapters: one environment, and vectors of one world with each way to go on."""
 
 import gymnasium
 import numpy as np
-from faces import Seen, keys_of
+from drivers import Seen, keys_of
 from gymnasium.vector import AutoresetMode
 
 import hipg_bench.gym  # noqa: F401 (registers)

@@ -1,7 +1,7 @@
-"""Drives the RLlib face."""
+"""Drives the RLlib adapter."""
 
 import numpy as np
-from faces import Seen, keys_of, over_agents
+from drivers import Seen, keys_of, over_agents
 
 from hipg_bench.adapters.rllib import HipgMultiAgentEnv
 

@@ -1,7 +1,7 @@
-"""Drives the Stable-Baselines3 face."""
+"""Drives the Stable-Baselines3 adapter."""
 
 import numpy as np
-from faces import Seen, keys_of
+from drivers import Seen, keys_of
 
 from hipg_bench.adapters.sb3 import HipgVecEnv
 

@@ -1,8 +1,8 @@
-"""Drives the TorchRL face."""
+"""Drives the TorchRL adapter."""
 
 import numpy as np
 import torch
-from faces import Seen
+from drivers import Seen
 
 from hipg_bench.adapters.torchrl import HipgEnv
 

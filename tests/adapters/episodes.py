@@ -1,11 +1,11 @@
-"""An episode behind a face, and the same one without it."""
+"""An episode behind an adapter, and the same one without it."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from faces import Face, Seen
+from drivers import Adapter, Seen
 
 import hipg_bench
 from hipg_bench import BatchEnv, Step
@@ -17,7 +17,7 @@ class Moment:
 
     Attributes:
         lived: (N,) who was alive before it.
-        seen: what the face showed.
+        seen: what the adapter showed.
         step: what the world itself said.
     """
 
@@ -37,7 +37,7 @@ class Moment:
 
 
 def world(task: str, seed: int = 0, **overrides) -> BatchEnv:
-    """What every face must agree with."""
+    """What every adapter must agree with."""
     return hipg_bench.make(task, 1, seed, threads=1, autoreset=False, **overrides)
 
 
@@ -47,12 +47,12 @@ def drawn(env: BatchEnv, seed: int, length: int) -> np.ndarray:
     return chance.uniform(-1, 1, (length, env.num_agents, env.action_size)).astype(np.float32)
 
 
-def played(face: Face, env: BatchEnv, actions: np.ndarray) -> list[Moment]:
-    """Step a face and its world, both just reset, until the face says that the episode is over."""
+def played(adapter: Adapter, env: BatchEnv, actions: np.ndarray) -> list[Moment]:
+    """Step an adapter and its world, both just reset, until the adapter says that the episode is over."""
     lived, moments = np.ones(env.num_agents, bool), []
     for action in actions:
         step = env.step(action[None])
-        moments.append(Moment(lived, face.step(action), step))
+        moments.append(Moment(lived, adapter.step(action), step))
         lived = moments[-1].alive
         if moments[-1].seen.over:
             break

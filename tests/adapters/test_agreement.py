@@ -1,9 +1,9 @@
-"""Every face agrees with `BatchEnv` step by step, bit for bit, over whole episodes with deaths."""
+"""Every adapter agrees with `BatchEnv` step by step, bit for bit, over whole episodes with deaths."""
 
 import numpy as np
 import pytest
+from drivers import ADAPTERS, open_adapter
 from episodes import drawn, played, world
-from faces import FACES, open_face
 
 TASKS = {
     "hazard_nav-4": {"hazard_peak": 0.2, "hazard_radius": 2.0},
@@ -21,24 +21,24 @@ def bits(array):
     return np.ascontiguousarray(array).tobytes()
 
 
-@pytest.mark.parametrize("name", FACES)
+@pytest.mark.parametrize("name", ADAPTERS)
 @pytest.mark.parametrize("task", TASKS)
 def test_a_face_shows_what_the_world_says(name, task):
-    face, env = open_face(name, task, 5, **TASKS[task]), world(task, 5, **TASKS[task])
+    adapter, env = open_adapter(name, task, 5, **TASKS[task]), world(task, 5, **TASKS[task])
     deaths, lengths = 0, []
     for k in range(EPISODES):
-        first, begun = face.reset(), env.reset()
+        first, begun = adapter.reset(), env.reset()
         assert begun.info["episode_id"][0] == k
         assert bits(first.observation) == bits(begun.observation[0])
         assert first.state is None or bits(first.state) == bits(begun.info["state"][0])
-        moments = played(face, env, drawn(env, k, env.spec.horizon))
+        moments = played(adapter, env, drawn(env, k, env.spec.horizon))
         for moment in moments:
-            check(face.dead, moment)
+            check(adapter.dead, moment)
         deaths += int((~moments[-1].alive).sum())
         lengths.append(len(moments))
     assert deaths > 0 or task == "coop_nav-3"
     assert min(lengths) > 1
-    face.close()
+    adapter.close()
 
 
 def check(dead, moment):
@@ -55,23 +55,23 @@ def check(dead, moment):
     assert seen.over == bool(step.terminated[0] or step.truncated[0] or lost)
 
 
-@pytest.mark.parametrize("name", FACES)
+@pytest.mark.parametrize("name", ADAPTERS)
 def test_a_seed_gives_the_same_episodes_whenever_it_is_given(name):
     task, numbers = "hazard_nav-4", TASKS["hazard_nav-4"]
-    face, env = open_face(name, task, 1, **numbers), world(task, 1, **numbers)
+    adapter, env = open_adapter(name, task, 1, **numbers), world(task, 1, **numbers)
     shown = []
     for broken_off in (0, 3):
-        face.reset()
+        adapter.reset()
         for action in drawn(env, 9, broken_off):
-            face.step(action)
+            adapter.step(action)
         env.reset(seed=7)
-        face.reset(seed=7)
-        moments = played(face, env, drawn(env, 0, 50))
+        adapter.reset(seed=7)
+        moments = played(adapter, env, drawn(env, 0, 50))
         env.reset()
-        second = face.reset()
-        moments += played(face, env, drawn(env, 1, 50))
+        second = adapter.reset()
+        moments += played(adapter, env, drawn(env, 1, 50))
         for moment in moments:
-            check(face.dead, moment)
+            check(adapter.dead, moment)
         shown.append(second.observation)
     assert bits(shown[0]) == bits(shown[1])
-    face.close()
+    adapter.close()

@@ -145,9 +145,9 @@ def test_unknown_names_are_met_with_the_nearest():
         hipg_bench.parallel_env(TASK, reward_dead="some")
 
 
-@pytest.mark.parametrize("face", [hipg_bench.parallel_env, HipgEnv])
-def test_a_picture_before_the_first_reset_or_after_close(face):
-    env = face(TASK, render_mode="rgb_array")
+@pytest.mark.parametrize("adapter", [hipg_bench.parallel_env, HipgEnv])
+def test_a_picture_before_the_first_reset_or_after_close(adapter):
+    env = adapter(TASK, render_mode="rgb_array")
     with refused(RenderError, "hazard_nav-4: nothing to render before reset() and after close()"):
         env.render()
     env.reset()

@@ -1,4 +1,4 @@
-"""What becomes of the dead, the same in every face: a row of the table is a test.
+"""What becomes of the dead, the same in every adapter: a row of the table is a test.
 
 | event at step t | ``remove`` | ``ghost`` | ``joint`` |
 |---|---|---|---|
@@ -12,15 +12,15 @@
 | revival | never | never | never |
 | keys of infos | always the same | always the same | always the same |
 
-``joint`` faces show the team as one agent. Its episode is the task's own, of which death is no end.
+``joint`` adapters show the team as one agent. Its episode is the task's own, of which death is no end.
 """
 
 import itertools
 
 import numpy as np
 import pytest
+from drivers import ADAPTERS, open_adapter
 from episodes import drawn, played, world
-from faces import FACES, open_face
 
 TASK = "hazard_nav-4"
 SPREAD = {"hazard_peak": 0.1, "hazard_radius": 2.0}
@@ -28,17 +28,17 @@ SPREAD = {"hazard_peak": 0.1, "hazard_radius": 2.0}
 SWIFT = {"hazard_peak": 0.9, "hazard_radius": 3.0}
 """One that nobody survives for long."""
 
-pytestmark = pytest.mark.parametrize("name", FACES)
+pytestmark = pytest.mark.parametrize("name", ADAPTERS)
 
 
 def episode(name, task=TASK, seed=0, told=lambda actions: actions, **overrides):
-    """The moments of one episode behind a face."""
-    face, env = open_face(name, task, seed, **overrides), world(task, seed, **overrides)
-    first, _ = face.reset(), env.reset()
+    """The moments of one episode behind an adapter."""
+    adapter, env = open_adapter(name, task, seed, **overrides), world(task, seed, **overrides)
+    first, _ = adapter.reset(), env.reset()
     actions = told(drawn(env, seed, env.spec.horizon))
-    moments = played(face, env, actions)
-    face.close()
-    return face.dead, first, moments
+    moments = played(adapter, env, actions)
+    adapter.close()
+    return adapter.dead, first, moments
 
 
 def only_some_died(moments):
@@ -205,13 +205,13 @@ def test_actions_for_the_dead_are_ignored(name, nonsense):
 
 
 def test_nobody_is_revived_within_an_episode_and_everyone_in_the_next(name):
-    face, env = open_face(name, TASK, **SWIFT, horizon=8), world(TASK, **SWIFT, horizon=8)
+    adapter, env = open_adapter(name, TASK, **SWIFT, horizon=8), world(TASK, **SWIFT, horizon=8)
     for k in range(3):
-        first = face.reset()
+        first = adapter.reset()
         env.reset()
         assert first.alive.all()
         assert first.live.all()
-        moments = played(face, env, drawn(env, k, 8))
+        moments = played(adapter, env, drawn(env, k, 8))
         assert not moments[-1].alive.all()
         for was, now in itertools.pairwise(moments):
             assert not (now.seen.alive & ~was.seen.alive).any()

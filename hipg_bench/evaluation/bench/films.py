@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from hipg_bench import registry
 from hipg_bench.rendering import film
-from hipg_bench.rendering.motion import Footage
-from hipg_bench.rendering.scene import Stage
+from hipg_bench.rendering.motion import Trajectory
+from hipg_bench.rendering.scene import Scene
 from hipg_bench.spec import TaskSpec
 
 _FPS = 30
@@ -136,13 +136,15 @@ def _bare(
     spec: TaskSpec, rows: Float[np.ndarray, "K R"], out: Path, size: tuple[int, int], frames: int
 ) -> _Shutter:
     """MuJoCo's renderer and the encoder, with the film's light, moments and views (worked out before)."""
-    footage = Footage(spec, rows)
-    stage, model = Stage(footage), footage.model
-    times = np.linspace(footage.time[0], footage.time[-1], frames).tolist()
+    trajectory = Trajectory(spec, rows)
+    scene, model = Scene(trajectory), trajectory.model
+    times = np.linspace(trajectory.time[0], trajectory.time[-1], frames).tolist()
     poses: list[tuple[np.ndarray, np.ndarray, mujoco.MjvCamera]] = []
     for moment in times:
-        footage.show(moment)
-        poses.append((footage.data.qpos.copy(), footage.data.mocap_pos.copy(), stage.camera(moment).mujoco()))
+        trajectory.show(moment)
+        poses.append(
+            (trajectory.data.qpos.copy(), trajectory.data.mocap_pos.copy(), scene.camera(moment).mujoco())
+        )
     data = mujoco.MjData(model)
     shutter = _Shutter()
     encoder = _encoder(out, size)

@@ -8,8 +8,8 @@ from typing import Any
 
 from hipg_bench.errors import RenderError
 from hipg_bench.evaluation.bench import films
+from hipg_bench.evaluation.bench.adapters import overheads
 from hipg_bench.evaluation.bench.child import Job
-from hipg_bench.evaluation.bench.faces import overheads
 from hipg_bench.evaluation.bench.machine import versions
 from hipg_bench.evaluation.bench.scaling import over_agents, over_worlds
 from hipg_bench.evaluation.bench.scoring import scoring_time
@@ -24,12 +24,12 @@ SCHEMA = 1
 _TEAM_SIZES = (2, 4, 8, 16, 31)
 _AGENTS_AT = 256
 """Worlds in which the cost against the number of agents is measured."""
-_FACES_AT = (1, 256)
+_ADAPTERS_AT = (1, 256)
 _AGENT = "mappo_minhealth"
 
 
 @dataclasses.dataclass(frozen=True)
-class Request:
+class BenchmarkPlan:
     """What is to be measured.
 
     Attributes:
@@ -53,18 +53,18 @@ class Request:
         return of_families if self.full else of_families[:1]
 
 
-def request(
+def make_plan(
     specs: Sequence[TaskSpec],
     *,
     num_envs: Sequence[int] = (),
     threads: Sequence[int] = (),
     seconds: float | None = None,
     full: bool = False,
-) -> Request:
+) -> BenchmarkPlan:
     """A request with everything that was left open filled in, threads 0 replaced by all cores."""
     cores = usable_cores()
     powers = [2**k for k in range(cores.bit_length()) if 2**k < cores]
-    return Request(
+    return BenchmarkPlan(
         specs=tuple(specs),
         num_envs=tuple(sorted(num_envs or ((1, 64, 1024, 4096) if full else (1, 64, 1024)))),
         threads=tuple(
@@ -76,7 +76,7 @@ def request(
 
 
 def document(
-    asked: Request, sections: Mapping[str, list[Any]], host: dict[str, Any], seconds: float
+    asked: BenchmarkPlan, sections: Mapping[str, list[Any]], host: dict[str, Any], seconds: float
 ) -> dict[str, Any]:
     """Everything for a script: rows by section, the machine as it was before, and how long it all took."""
     return {
@@ -92,14 +92,14 @@ def document(
     }
 
 
-def _steps(asked: Request) -> list[Job]:
+def _steps(asked: BenchmarkPlan) -> list[Job]:
     return [
         Job("steps", step_rate, (spec, size, count, asked.seconds))
         for spec in asked.specs for count in asked.threads for size in asked.num_envs
     ]  # fmt: skip
 
 
-def _reset(asked: Request) -> list[Job]:
+def _reset(asked: BenchmarkPlan) -> list[Job]:
     specs = asked.specs if asked.full else {spec.family: spec for spec in asked.specs}.values()
     sizes = sorted({asked.num_envs[0], asked.num_envs[-1]})
     return [
@@ -108,10 +108,10 @@ def _reset(asked: Request) -> list[Job]:
     ]  # fmt: skip
 
 
-def _render(asked: Request) -> list[Job]:
+def _render(asked: BenchmarkPlan) -> list[Job]:
     backend = gl.working_backend()
     if backend is None:
-        raise RenderError(f"no OpenGL works here, so nothing can be rendered: run\n  {gl.MEND}")
+        raise RenderError(f"no OpenGL works here, so nothing can be rendered: run\n  {gl.INSTALL_COMMAND}")
     size, frames = ((1280, 720), 60) if asked.full else ((640, 360), 20)
     variables = gl.environment(backend)
     return [
@@ -119,25 +119,25 @@ def _render(asked: Request) -> list[Job]:
     ]
 
 
-def _evaluate(asked: Request) -> list[Job]:
+def _evaluate(asked: BenchmarkPlan) -> list[Job]:
     agent = load_agent(_AGENT)
     specs = tuple(spec for spec in asked.specs if agent.train_seeds(spec.task))
     episodes = 320 if asked.full else 32
     return [Job("evaluate", scoring_time, (_AGENT, specs, episodes, asked.threads[-1]))] if specs else []
 
 
-def _start(asked: Request) -> list[Job]:
+def _start(asked: BenchmarkPlan) -> list[Job]:
     return [Job("start", start_times, (asked.seconds,))]
 
 
-def _faces(asked: Request) -> list[Job]:
+def _adapters(asked: BenchmarkPlan) -> list[Job]:
     return [
-        Job("faces", overheads, (spec, size, 1 if size == 1 else asked.threads[-1], asked.seconds))
-        for spec in asked.examples for size in _FACES_AT
+        Job("adapters", overheads, (spec, size, 1 if size == 1 else asked.threads[-1], asked.seconds))
+        for spec in asked.examples for size in _ADAPTERS_AT
     ]  # fmt: skip
 
 
-def _scaling(asked: Request) -> list[Job]:
+def _scaling(asked: BenchmarkPlan) -> list[Job]:
     count, top = asked.threads[-1], asked.num_envs[-1]
     sizes = [4**k for k in range(top.bit_length()) if 4**k <= top]
     seconds = 2 * asked.seconds
@@ -151,8 +151,8 @@ def _scaling(asked: Request) -> list[Job]:
     ]
 
 
-SECTIONS: Mapping[str, Callable[[Request], list[Job]]] = {
+SECTIONS: Mapping[str, Callable[[BenchmarkPlan], list[Job]]] = {
     "steps": _steps, "reset": _reset, "render": _render, "evaluate": _evaluate, "start": _start,
-    "faces": _faces, "scaling": _scaling,
+    "adapters": _adapters, "scaling": _scaling,
 }  # fmt: skip
 """Name to the jobs that a request means; training is measured by `hipg_bench.learning.bench`."""

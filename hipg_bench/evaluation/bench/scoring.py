@@ -7,7 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from hipg_bench.evaluation.episodes import Plan
+from hipg_bench.evaluation.episodes import EvaluationJob
 from hipg_bench.evaluation.runner import Suite, evaluate
 from hipg_bench.policies.bundle import load_agent
 from hipg_bench.spec import TaskSpec
@@ -49,7 +49,9 @@ def scoring_time(agent: str, specs: tuple[TaskSpec, ...], episodes: int, threads
     who = load_agent(agent)
     started = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="hipg-bench-") as folder:
-        results = evaluate(who, Suite("bench", specs), Path(folder), Plan(episodes=episodes, threads=threads))
+        results = evaluate(
+            who, Suite("bench", specs), Path(folder), EvaluationJob(episodes=episodes, threads=threads)
+        )
     whole = time.perf_counter() - started
     played = {task["task"]: task["episodes"] for task in results["tasks"]}
     taken = [(task, count, results["timing"]["seconds"][task]) for task, count in played.items()]

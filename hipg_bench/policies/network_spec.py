@@ -32,7 +32,7 @@ Stack = list[tuple[np.ndarray, np.ndarray]]
 """Weights (in, out) and biases of one layer after another."""
 
 
-class Form(Params):
+class NetworkSpec(Params):
     """What a policy file declares beside its weights; by itself it is an MLP's.
 
     Attributes:
@@ -59,16 +59,16 @@ class Form(Params):
         """The last layer's outputs as actions, in [-reach, reach] unless the head is ``linear``."""
         if self.head == "bins":
             values = out.reshape(*out.shape[:-1], -1, self.bins)
-            best = on_grid(values).argmax(-1)  # rounded: equal values stay equal, the first wins
+            best = quantize(values).argmax(-1)  # rounded: equal values stay equal, the first wins
             chosen = 2.0 * best / (self.bins - 1) - 1.0
         elif self.head == "linear":
             chosen = out
         else:
             chosen = np.tanh(out) if self.head == "tanh" else np.clip(out, -1.0, 1.0)
-        return on_grid(chosen * self.reach)
+        return quantize(chosen * self.reach)
 
 
-def on_grid(x: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+def quantize(x: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
     """Rounded to multiples of 2^-16."""
     return np.round(x * _GRID) / _GRID
 
@@ -86,10 +86,12 @@ def layers(tensors: Tensors, name: str) -> Stack:
     ]
 
 
-def through(stack: Stack, hidden: Float[np.ndarray, "X Y in"], form: Form) -> Float[np.ndarray, "X Y out"]:
+def forward(
+    stack: Stack, hidden: Float[np.ndarray, "X Y in"], spec: NetworkSpec
+) -> Float[np.ndarray, "X Y out"]:
     """Apply a stack, with activations between its layers and none after the last."""
     for weight, bias in stack[:-1]:
-        hidden = form.activate(hidden @ weight + bias)
+        hidden = spec.activate(hidden @ weight + bias)
     weight, bias = stack[-1]
     return hidden @ weight + bias
 
@@ -132,12 +134,12 @@ def check_stack(shapes: Shapes, name: str, width: int, lead: tuple[int, ...] = (
     return width
 
 
-def check_head(form: Form, outputs: int) -> None:
+def check_head(spec: NetworkSpec, outputs: int) -> None:
     """Refuse outputs that are no actions."""
-    if (form.head == "bins") != (form.bins >= 2):
-        raise BundleError(f"2 or more bins belong to the head 'bins', got {form.bins}, {form.head!r}")
-    if form.bins and outputs % form.bins:
-        raise BundleError(f"{outputs} outputs are not a multiple of {form.bins} bins")
+    if (spec.head == "bins") != (spec.bins >= 2):
+        raise BundleError(f"2 or more bins belong to the head 'bins', got {spec.bins}, {spec.head!r}")
+    if spec.bins and outputs % spec.bins:
+        raise BundleError(f"{outputs} outputs are not a multiple of {spec.bins} bins")
 
 
 def check_shape(shapes: Shapes, name: str, expected: tuple[int, ...]) -> None:

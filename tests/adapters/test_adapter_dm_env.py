@@ -288,7 +288,7 @@ np.save(sys.argv[1], np.stack(frames))
 def test_pixels_through_the_suites_wrapper(tmp_path):
     backend = gl.working_backend()
     if backend is None:
-        pytest.skip(f"no OpenGL works here: {gl.MEND}")
+        pytest.skip(f"no OpenGL works here: {gl.INSTALL_COMMAND}")
     child = subprocess.run(
         [sys.executable, "-c", PIXELS, tmp_path / "frames.npy"], env=gl.environment(backend),
         capture_output=True, text=True, timeout=300, check=False,

@@ -13,7 +13,7 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
 _LARGE = 1 << 30
 
 
-def prepare() -> None:
+def configure() -> None:
     """Let this process multiply matrices in float32 with AVX-512, and keep the memory it has touched.
 
     Products go through oneDNN, which uses AVX-512 on every brand of processor: on an AMD EPYC 2.2 times as
@@ -21,7 +21,7 @@ def prepare() -> None:
     bfloat16, which oneDNN takes where a processor has units for matrices (AMX) and which is wrong by up to
     1 % of an action: hence the limit on instructions, which must be set before the first product. The last
     bits of sums still depend on the processor. Freed arrays are kept for the next minibatch: the system
-    would hand out the pages of large ones anew, filled with zeros, every time.
+    would hand out the pages of large ones again, filled with zeros, every time.
     """
     os.environ.setdefault("ONEDNN_MAX_CPU_ISA", "AVX512_CORE")
     torch.set_float32_matmul_precision("medium")

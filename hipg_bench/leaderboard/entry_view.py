@@ -25,7 +25,7 @@ WORLDS: tuple[Worlds, ...] = ("hidden", "public")
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class EntryView:
     """An entry, read.
 
     Attributes:
@@ -116,17 +116,17 @@ def rows_path(worlds: Worlds, split: str, task: str) -> str:
     return f"{run_path(worlds, split)}/episodes/{task}.jsonl.gz"
 
 
-def read_board(board: Board) -> list[Shown]:
+def read_board(board: Board) -> list[EntryView]:
     """Read all entries, in the order of their names.
 
     Raises:
         HipgError: an entry is damaged.
     """
     commitment = read_commitments(board.root).sha256
-    return [read_shown(board.folder(name), commitment) for name in board.names()]
+    return [read_entry_view(board.folder(name), commitment) for name in board.names()]
 
 
-def read_shown(folder: Path, commitment: str | None) -> Shown:
+def read_entry_view(folder: Path, commitment: str | None) -> EntryView:
     """Read an entry's folder, while ``commitment`` is that of the board's hidden worlds.
 
     Raises:
@@ -140,7 +140,7 @@ def read_shown(folder: Path, commitment: str | None) -> Shown:
         for split in SPLITS
         if (path := folder / run_path(worlds, split) / "results.json").is_file()
     }
-    return Shown(
+    return EntryView(
         entry,
         read_card(folder / "agent.toml"),
         readme.read_text(encoding="utf-8", errors="replace") if readme.is_file() else "",

@@ -1,8 +1,8 @@
-"""One way to drive every face: what it shows of one world, as arrays over all N agents.
+"""One way to drive every adapter: what it shows of one world, as arrays over all N agents.
 
 A driver lives in ``drive_<library>.py`` and has one line in `DRIVERS`. It imports its library at its top;
-`open_face` skips the test where that library is not installed, so the same tests run in any environment
-that has some of the faces (``pytest tests/adapters -k rllib``).
+`open_adapter` skips the test where that library is not installed, so the same tests run in any environment
+that has some of the adapters (``pytest tests/adapters -k rllib``).
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ Mode = Literal["remove", "ghost", "joint"]
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What a face returned from ``reset`` or ``step``.
+    """What an adapter returned from ``reset`` or ``step``.
 
     Attributes:
-        observation: (N, O) float32, NaN rows for agents that the face did not report.
-        reward: (N,) what each agent was paid, NaN for those not reported; the team's in joint faces.
+        observation: (N, O) float32, NaN rows for agents that the adapter did not report.
+        reward: (N,) what each agent was paid, NaN for those not reported; the team's in joint adapters.
         terminated, truncated: (N,) as told to each agent, False for those not reported.
         reported: (N,) the agent appears in what was returned.
-        live: (N,) the face still lists the agent, and expects an action of it.
-        alive: (N,) the agent's health is above 0, as the face tells it.
-        state: (S,) joint state, None where the face has none.
-        over: the episode is over; faces that start the next one at once show the one that ended all the same.
+        live: (N,) the adapter still lists the agent, and expects an action of it.
+        alive: (N,) the agent's health is above 0, as the adapter tells it.
+        state: (S,) joint state, None where the adapter has none.
+        over: the episode is over; adapters that start the next one at once show the one that ended all the
+            same.
         info_keys: the different sets of keys of the infos returned; one, always the same, is right.
     """
 
@@ -47,7 +48,7 @@ class Seen:
     info_keys: frozenset[tuple[str, ...]]
 
 
-class Face(Protocol):
+class Adapter(Protocol):
     """One world behind one API.
 
     Attributes:
@@ -84,14 +85,14 @@ DRIVERS: Mapping[str, tuple[str, str]] = {
     "torchrl": ("torchrl", "drive_torchrl:Group"),
     "rllib": ("ray", "drive_rllib:Leaving"),
 }
-"""Face to the library it needs and its driver."""
+"""Adapter to the library it needs and its driver."""
 
-FACES = tuple(DRIVERS)
+ADAPTERS = tuple(DRIVERS)
 """What the truth table and the agreement tests go through."""
 
 
-def open_face(name: str, task: str, seed: int = 0, **overrides: Any) -> Face:
-    """One world of a task behind the face ``name``; skips the test without its library."""
+def open_adapter(name: str, task: str, seed: int = 0, **overrides: Any) -> Adapter:
+    """One world of a task behind the adapter ``name``; skips the test without its library."""
     library, driver = DRIVERS[name]
     pytest.importorskip(library)
     module, kind = driver.split(":")

@@ -141,7 +141,7 @@ def _look_at_record(name: str, path: Path) -> Iterator[Finding]:
             return
         columns = next(csv.reader(text.splitlines()), [])
     except (ValueError, RecursionError, csv.Error) as trouble:
-        yield error(name, f"cannot be read: {trouble}", "write it anew or remove it")
+        yield error(name, f"cannot be read: {trouble}", "rewrite or remove it")
         return
     missing = [
         " or ".join(names) for names in (("steps",), ("eval_return", "return")) if not {*names} & {*columns}

@@ -1,4 +1,4 @@
-"""How good a policy is by now: it plays, without exploration, worlds it is neither trained nor scored on."""
+"""Periodic evaluation: a policy plays without exploration in worlds used for neither training nor scores."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from hipg_bench.registry import make, task_spec
 SEED = 30_000
 """The worlds' seed. Training has the seeds 0..999, scores those from 1000 on, calibration 10,000 and 20,000.
 
-It is one for all runs, so that the points of all curves of a task are of the same worlds and the same luck.
+It is one for all runs, so that the points of all curves of a task are of the same worlds and the same random
+numbers.
 """
 
 
@@ -23,8 +24,8 @@ def num_episodes(task: str) -> int:
     return 128 if "paper" in task_spec(task).tags else 32
 
 
-class Trial:
-    """The worlds of a task on which learners are tried.
+class PeriodicEvaluation:
+    """The worlds of a task in which learners are evaluated periodically.
 
     Attributes:
         env: the worlds, paid as the task pays, without the weights of training.
@@ -36,7 +37,7 @@ class Trial:
     def play(self, policy: Policy) -> dict[str, float]:
         """Play every world's first episode.
 
-        Draws nothing from torch's or NumPy's global chance: a run goes on as if it had not been tried.
+        Draws nothing from torch's or NumPy's global random state: a run is the same with and without it.
 
         Returns:
             ``eval_return``, the mean return; and where the task has anchors ``score``, the same on their

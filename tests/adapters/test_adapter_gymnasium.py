@@ -69,7 +69,7 @@ def test_the_joint_vectors_are_the_agents_one_after_another():
     assert sum(value for name, value in info.items() if name.startswith("reward_")) == pytest.approx(reward)
 
 
-@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.MEND}")
+@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.INSTALL_COMMAND}")
 def test_pictures_show_what_has_changed():
     env = gymnasium.make(f"hipg/{TASK}-v1", render_mode="rgb_array")
     env.reset(seed=0)

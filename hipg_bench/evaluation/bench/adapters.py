@@ -1,4 +1,4 @@
-"""What each API face adds to a step of `BatchEnv`."""
+"""What each API adapter adds to a step of `BatchEnv`."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _TURN = 50
 
 @dataclasses.dataclass(frozen=True)
 class Overhead:
-    """Of one face; numbers are None where it was left out.
+    """Of one adapter; numbers are None where it was left out.
 
     Attributes:
-        face, task, num_envs, threads: what was run.
+        adapter, task, num_envs, threads: what was run.
         step_us: per step of all worlds, resets included.
         batch_us: the same of `BatchEnv`.
         overhead: the first over the second - 1, the median of the rounds' own ratios.
         left_out: why, empty where it was not.
     """
 
-    face: str
+    adapter: str
     task: str
     num_envs: int
     threads: int
@@ -48,11 +48,11 @@ Stepper = Callable[[], object]
 
 
 def overheads(spec: TaskSpec, num_envs: int, threads: int, seconds: float) -> list[Overhead]:
-    """Step every face, and the worlds without any, in turn.
+    """Step every adapter, and the worlds without any, in turn.
 
     Args:
         spec: the task.
-        num_envs: B; with more than one, faces of one world are not asked.
+        num_envs: B; with more than one, adapters of one world are not asked.
         threads: physics threads of all worlds, 0 for all cores; one world has one.
         seconds: for all together.
     """
@@ -62,24 +62,24 @@ def overheads(spec: TaskSpec, num_envs: int, threads: int, seconds: float) -> li
     pool = itertools.cycle(actions)
     contenders = {_BATCH: Contender(lambda: env.step(next(pool)))}
     left_out: dict[str, str] = {}
-    faces = {**_ONE_WORLD, **_MANY_WORLDS} if num_envs == 1 else _MANY_WORLDS
-    for face, opened in faces.items():
+    adapters = {**_ONE_WORLD, **_MANY_WORLDS} if num_envs == 1 else _MANY_WORLDS
+    for adapter, opened in adapters.items():
         try:
-            contenders[face] = Contender(opened(spec, actions, threads))
+            contenders[adapter] = Contender(opened(spec, actions, threads))
         except ImportError as error:
-            left_out[face] = str(error)
+            left_out[adapter] = str(error)
     times = in_turn(contenders, seconds, calls=_TURN)
     measured = [
         Overhead(
-            face, spec.task, num_envs, threads,
-            step_us=1e6 * times.median(face),
+            adapter, spec.task, num_envs, threads,
+            step_us=1e6 * times.median(adapter),
             batch_us=1e6 * times.median(_BATCH),
-            overhead=times.ratio(face, _BATCH) - 1,
+            overhead=times.ratio(adapter, _BATCH) - 1,
         )
-        for face in contenders if face != _BATCH
+        for adapter in contenders if adapter != _BATCH
     ]  # fmt: skip
     return measured + [
-        Overhead(face, spec.task, num_envs, threads, left_out=why) for face, why in left_out.items()
+        Overhead(adapter, spec.task, num_envs, threads, left_out=why) for adapter, why in left_out.items()
     ]
 
 
@@ -174,12 +174,12 @@ def _torchrl(spec: TaskSpec, actions: Actions, threads: int) -> Stepper:
     return step
 
 
-Face = Callable[[TaskSpec, Actions, int], Stepper]
+Adapter = Callable[[TaskSpec, Actions, int], Stepper]
 
-_ONE_WORLD: Mapping[str, Face] = {
+_ONE_WORLD: Mapping[str, Adapter] = {
     "pettingzoo": _pettingzoo, "rllib": _rllib, "gymnasium": _gymnasium, "dm_env": _dm_env,
 }  # fmt: skip
-_MANY_WORLDS: Mapping[str, Face] = {
+_MANY_WORLDS: Mapping[str, Adapter] = {
     "gymnasium vector": _gymnasium_vector, "stable-baselines3": _sb3, "torchrl": _torchrl,
 }  # fmt: skip
-"""Faces that step B worlds at once."""
+"""Adapters that step B worlds at once."""

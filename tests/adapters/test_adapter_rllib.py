@@ -1,4 +1,4 @@
-"""The RLlib face: what RLlib itself makes of its episodes, and a real learner. `make test-rllib` runs it."""
+"""The RLlib adapter: RLlib's own view of its episodes, and a real learner. `make test-rllib` runs it."""
 
 import re
 import subprocess

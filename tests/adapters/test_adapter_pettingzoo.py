@@ -189,7 +189,7 @@ def test_an_aec_episode_pays_what_the_parallel_one_pays(dead):
 # pictures
 
 
-@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.MEND}")
+@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.INSTALL_COMMAND}")
 @pytest.mark.parametrize("task", ["hazard_comm-10", "multiwalker-3", "paper_nav-4"])
 def test_pictures_show_what_has_changed(task):
     env = hipg_bench.parallel_env(task, render_mode="rgb_array")
@@ -210,7 +210,7 @@ def test_pictures_show_what_has_changed(task):
     np.testing.assert_allclose(frames[1].astype(int), frames[3], atol=3)
 
 
-@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.MEND}")
+@pytest.mark.skipif(gl.working_backend() is None, reason=f"no OpenGL: {gl.INSTALL_COMMAND}")
 def test_a_renderer_that_dies_is_an_error_and_the_next_picture_comes_from_another():
     env, other = (hipg_bench.parallel_env("coop_nav-3", render_mode="rgb_array", seed=3) for _ in range(2))
     for one in (env, other):
@@ -223,7 +223,7 @@ def test_a_renderer_that_dies_is_an_error_and_the_next_picture_comes_from_anothe
     np.testing.assert_array_equal(env.render(), other.render())
     for one in (env, other):
         one.step({agent: np.zeros(3) for agent in one.agents})
-    # interpolated motion begins anew in the second child, so a few pixels may differ
+    # interpolated motion starts again in the second child, so a few pixels may differ
     assert np.abs(env.render().astype(int) - other.render()).mean() < 1
     env.close()
     other.close()
@@ -265,4 +265,4 @@ def test_without_opengl_the_error_says_how_to_get_it():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "RenderError: coop_nav-3: no OpenGL works" in done.stderr
-    assert gl.MEND in done.stderr
+    assert gl.INSTALL_COMMAND in done.stderr
