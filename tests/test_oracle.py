@@ -197,7 +197,7 @@ def test_toughness_is_exponential():
 
 
 def test_deaths_do_not_depend_on_who_else_is_there():
-    """Paired luck: what one agent does cannot change another's toughness."""
+    """Paired random numbers: what one agent does cannot change another's toughness."""
     env = make("hazard_nav-4", 2, threads=1)
     env.reset(np.array([5, 5]))
     first = env.recall(env.rows, "toughness").copy()

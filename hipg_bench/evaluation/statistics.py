@@ -152,7 +152,7 @@ def paired_difference(
 ) -> tuple[float, Interval]:
     """How much more we reach than they do in the same worlds: mean, and 95 % interval.
 
-    Luck that both meet cancels: worlds are redrawn together, runs on each side on their own.
+    Randomness that both meet cancels: worlds are redrawn together, runs on each side on their own.
 
     Args:
         ours: return or score of each run in each world.
