@@ -10,8 +10,7 @@ import tempfile
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
+from hipg_bench.claims import Claim, claimed
 from hipg_bench.errors import ResumeError
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -38,8 +37,6 @@ def is_installed() -> bool:
     return (_PACKAGE / "data").is_dir()
 
 
-LOCK = ".hipg-bench.lock"
-"""The file in an output folder that the process working there holds."""
 PARTIAL = ".hipg-bench-partial-"
 """What folders of half-written files are called, so that they can be told from users' files."""
 
@@ -111,7 +108,7 @@ def remove_partial(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def output_folder(out: Path, record: str, results: Sequence[str], doing: str) -> Generator[None]:
+def output_folder(out: Path, record: str, results: Sequence[str], doing: str) -> Generator[Claim]:
     """Hold an output folder alone, and only if it is empty of others' files that would be overwritten.
 
     Args:
@@ -130,12 +127,8 @@ def output_folder(out: Path, record: str, results: Sequence[str], doing: str) ->
                     f"{out} holds {name!r} but no {record}, so it is not of an earlier run, and nothing "
                     f"is overwritten: choose another --out"
                 )
-    out.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(out / LOCK).acquire(timeout=0):
-            yield
-    except Timeout as error:
-        raise ResumeError(f"{out}: another process is {doing} here") from error
+    with claimed(out, doing) as claim:
+        yield claim
 
 
 def new_folder(parent: Path, name: str) -> Path:

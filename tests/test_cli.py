@@ -11,7 +11,7 @@ import time
 import pytest
 
 from hipg_bench import make, task_spec, tasks
-from hipg_bench.paths import LOCK, PARTIAL
+from hipg_bench.paths import PARTIAL
 from hipg_bench.rendering import gl
 
 # a test run in the background ignores SIGINT, and so would its children
@@ -89,7 +89,7 @@ def test_evaluate_end_to_end(tmp_path):
     assert folder.name.startswith("random-")
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert names == {
-        "run.json", LOCK, "results.json", "report.html",
+        "run.json", "results.json", "report.html",
         f"episodes/{TASK}.jsonl", "episodes/multiwalker-3.jsonl",
         f"episodes/.{TASK}.jsonl.sha256", "episodes/.multiwalker-3.jsonl.sha256",
     }  # fmt: skip

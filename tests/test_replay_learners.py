@@ -15,7 +15,6 @@ from hipg_bench.learning import maddpg, qmix
 from hipg_bench.learning.replay import Replay
 from hipg_bench.learning.run import Learner, new_learner, train
 from hipg_bench.learning.settings import ALGORITHMS, paper, recommended
-from hipg_bench.paths import LOCK
 from hipg_bench.policies.network import load_network
 
 SMALL = {
@@ -361,7 +360,7 @@ def test_a_finished_run_is_left_alone_and_gives_its_disk_back(algorithm, tmp_pat
     train(settings, tmp_path, command="test")
     assert (tmp_path / "policy.safetensors").read_bytes() == before
     assert {path.name for path in tmp_path.iterdir()} == {
-        "checkpoint.pt", "policy.safetensors", "curve.csv", "train.json", "tensorboard", LOCK,
+        "checkpoint.pt", "policy.safetensors", "curve.csv", "train.json", "tensorboard",
         ".checkpoint.pt.sha256", ".curve.csv.sha256",
     }  # fmt: skip
     with pytest.raises(ResumeError, match="replay"):

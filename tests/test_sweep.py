@@ -11,15 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 from typer.testing import CliRunner
 
 import hipg_bench
+from hipg_bench.claims import Claim
 from hipg_bench.cli import app
 from hipg_bench.errors import ResumeError, SpecError
+from hipg_bench.launchers import Local
 from hipg_bench.learning import sweep
 from hipg_bench.learning.run import train
-from hipg_bench.paths import LOCK
 from hipg_bench.registry import tagged
 
 ROOT = Path(hipg_bench.__file__).resolve().parents[1]
@@ -48,7 +48,7 @@ def test_a_sweep_trains_every_combination_and_only_what_is_missing(tmp_path: Pat
     done_before = runs[0]
     train(done_before.settings, done_before.out, command="by hand")
     seen: list[int] = []
-    sweep.work_off(runs, 2, lambda runs: seen.append(sum(run.finished for run in runs)))
+    sweep.work_off(runs, Local(2), lambda runs: seen.append(sum(run.finished for run in runs)))
     assert seen[-1] == 4
     records = [json.loads((run.out / "train.json").read_text()) for run in runs]
     assert records[0]["command"] == "by hand", "a finished run is left alone"
@@ -74,9 +74,9 @@ def test_a_killed_sweep_leaves_nobody_training_and_goes_on(tmp_path: Path) -> No
         train(runs[0].settings, runs[0].out, command="beside it")
     process.kill()
     process.wait()
-    lock = FileLock(runs[0].out / LOCK)
-    lock.acquire(timeout=60)  # the worker lets go
-    lock.release()
+    claim = Claim(runs[0].out)
+    wait_until(claim.take)  # the worker lets go
+    claim.release()
     assert 0 < runs[0].done < 4000
     train(runs[0].settings, runs[0].out, command="once more")
     train(runs[0].settings, tmp_path / "whole", command="never killed")

@@ -11,6 +11,7 @@ import typer
 from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
+    from hipg_bench.launchers import Launcher
     from hipg_bench.policies.bundle import Agent
     from hipg_bench.spec import TaskSpec
 
@@ -53,6 +54,47 @@ SetOption = Annotated[
     typer.Option("--set", help="Change a number of the task, as name=value; may be repeated."),
 ]
 
+LauncherOption = Annotated[
+    str,
+    typer.Option(
+        "--launcher",
+        help="Where jobs run: local (processes of this machine), ray or slurm; see docs/clusters.md.",
+    ),
+]
+LauncherOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--launcher-option",
+        help="A setting of the launcher as name=value, such as address=auto for ray or "
+        "slurm_partition=cpu for slurm; may be repeated.",
+    ),
+]
+
+
+def launcher_of(name: str, workers: int | None, options: list[str] | None) -> Launcher:
+    """The launcher that was asked for; ``workers`` is by default the number of usable cores.
+
+    Raises:
+        SpecError: no such launcher or option.
+        HipgError: its library is not installed.
+    """
+    from hipg_bench.launchers import launcher
+    from hipg_bench.processes import usable_cores
+
+    return launcher(name, workers or usable_cores(), parse_pairs(options, "--launcher-option"))
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """``I/N`` as the index from 0 and the number of shards.
+
+    Raises:
+        SpecError: anything else.
+    """
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
+        raise SpecError(f"--shard takes I/N with I from 1 to N, such as 1/8, got {text!r}")
+    return int(index) - 1, int(count)
+
 
 def task_of(task: str, num_agents: int | None = None, changes: list[str] | None = None) -> TaskSpec:
     """The task that a name or file and some changed numbers stand for.
@@ -88,7 +130,7 @@ def task_for(
     return task_of(task or agent.tasks[0], num_agents, changes)
 
 
-def parse_pairs(pairs: list[str] | None) -> dict[str, Any]:
+def parse_pairs(pairs: list[str] | None, option: str = "--set") -> dict[str, Any]:
     """``name=value`` options; a value that is not JSON is text.
 
     Raises:
@@ -98,7 +140,7 @@ def parse_pairs(pairs: list[str] | None) -> dict[str, Any]:
     for pair in pairs or []:
         name, equals, value = pair.partition("=")
         if not equals:
-            raise SpecError(f"--set takes name=value, got {pair!r}")
+            raise SpecError(f"{option} takes name=value, got {pair!r}")
         try:
             parsed[name] = json.loads(value)
         except json.JSONDecodeError:

@@ -11,10 +11,14 @@ import typer
 
 from hipg_bench.cli import console
 from hipg_bench.cli.options import (
+    LauncherOption,
+    LauncherOptions,
     NumAgentsOption,
     calibrate_hint,
     complete_task,
+    launcher_of,
     parse_pairs,
+    parse_shard,
     quoted,
     task_of,
     task_option,
@@ -22,6 +26,7 @@ from hipg_bench.cli.options import (
 from hipg_bench.errors import SpecError, hint
 
 if TYPE_CHECKING:
+    from hipg_bench.launchers import Launcher
     from hipg_bench.learning.settings import AnySettings
     from hipg_bench.spec import TaskSpec
 
@@ -75,6 +80,12 @@ def train(
     track: Annotated[
         list[str] | None, typer.Option(help="Show the run in wandb or trackio too; may be repeated.")
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(help="I/N: train only part I of N of a sweep, counted from 1."),
+    ] = None,
+    launcher: LauncherOption = "local",
+    launcher_option: LauncherOptions = None,
     status: Annotated[bool, typer.Option("--status", help="Show the sweep's progress and exit.")] = False,
 ) -> None:
     """Train one run or a sweep. Run the same command again to resume."""
@@ -82,11 +93,14 @@ def train(
         raise SpecError("train takes either --task or --sweep; --status belongs to the latter")
     from hipg_bench.processes import usable_cores
 
+    if sweep is None and (shard is not None or launcher != "local"):
+        raise SpecError("--shard and --launcher belong to --sweep")
     if sweep is not None and status:
         _tell(sweep, out or Path("runs") / sweep.stem, workers or usable_cores())
         return
     if sweep is not None:
-        _train_many(sweep, out or Path("runs") / sweep.stem, workers or usable_cores())
+        engine = launcher_of(launcher, workers, launcher_option)
+        _train_many(sweep, out or Path("runs") / sweep.stem, engine, shard)
         return
 
     import torch
@@ -205,21 +219,27 @@ def _print_result(settings: AnySettings, out: Path) -> None:
         console.say(f"  hipg-bench submit init my_agent --from-run {quoted(out)} --authors YOU --license MIT")
 
 
-def _train_many(sweep: Path, out: Path, workers: int) -> None:
-    from hipg_bench.learning.sweep import Run, load, work_off
+def _train_many(sweep: Path, out: Path, engine: Launcher, part: str | None) -> None:
+    from hipg_bench.learning.sweep import Run, load, shard, work_off
+    from hipg_bench.paths import write_text
 
     runs = load(sweep, out)
+    write_text(out / "sweep.toml", sweep.read_text(encoding="utf-8"))  # what `status` reads
+    if part is not None:
+        index, count = parse_shard(part)
+        runs = shard(runs, index, count)
     left = sum(not run.finished for run in runs)
-    console.say(f"{sweep.name}: {left} of {len(runs)} runs to do, {workers} at a time, into {out}")
+    at_a_time = "" if engine.slots is None else f", {engine.slots} at a time"
+    console.say(f"{sweep.name}: {left} of {len(runs)} runs to do{at_a_time}, into {out}")
     with console.progress() as bars:
         bar = bars.add_task("training", total=sum(run.settings.steps for run in runs))
 
         def report(runs: list[Run]) -> None:
-            ended = sum(run.finished for run in runs)
-            steps = sum(min(run.done, run.settings.steps) for run in runs)
-            bars.update(bar, completed=steps, description=f"{ended}/{len(runs)} runs")
+            done = [min(run.done, run.settings.steps) for run in runs]
+            ended = sum(steps >= run.settings.steps for steps, run in zip(done, runs, strict=True))
+            bars.update(bar, completed=sum(done), description=f"{ended}/{len(runs)} runs")
 
-        work_off(runs, workers, report)
+        work_off(runs, engine, report)
     console.say(f"{len(runs)} runs are finished in {out}")
 
 

@@ -19,6 +19,7 @@ from typing import Any, Protocol, runtime_checkable
 import mujoco
 import torch
 
+from hipg_bench.claims import Claim
 from hipg_bench.errors import HipgError, ResumeError
 from hipg_bench.learning import mappo, periodic_evaluation, torch_setup
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
@@ -123,9 +124,9 @@ def train(
     """
     check_services(track)
     torch_setup.configure()
-    with output_folder(out, RECORD, _RESULTS, "training"):
+    with output_folder(out, RECORD, _RESULTS, "training") as claim:
         remove_partial(out)
-        _train_alone(settings, out, command, report, track)
+        _train_alone(settings, out, claim, command, report, track)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,6 +166,7 @@ def last_evaluation(out: Path) -> Evaluated | None:
 def _train_alone(
     settings: AnySettings,
     out: Path,
+    claim: Claim,
     command: str,
     report: Callable[[int, Log], None] | None,
     track: tuple[str, ...],
@@ -193,6 +195,7 @@ def _train_alone(
             stack.callback(tracker.close)
         while learner.iteration < settings.iterations:
             log = learner.iterate()
+            claim.check()
             learner.save_policy(policy)
             if settings.evaluates_after(learner.iteration):
                 log |= worlds.play(load_network(policy))

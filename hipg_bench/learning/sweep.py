@@ -1,4 +1,4 @@
-"""Many training runs from one file, one process per core; a stopped sweep resumes.
+"""Many training runs from one file, one per core; a stopped sweep resumes.
 
 A sweep file lists groups of runs::
 
@@ -19,27 +19,20 @@ import itertools
 import json
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterator
-from multiprocessing import connection
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 import pydantic
 import torch
 
-from hipg_bench import processes
+from hipg_bench import launchers
 from hipg_bench.documents import read_json, read_toml
-from hipg_bench.errors import HipgError, ResumeError, SpecError
+from hipg_bench.errors import ResumeError, SpecError
+from hipg_bench.launchers import Job, Launcher
 from hipg_bench.learning.run import train
 from hipg_bench.learning.settings import PRESETS, AnySettings
 from hipg_bench.spec import Params, parse
-
-_LOOK_EVERY = 5.0
-"""Seconds between two looks at how far the runs are."""
-_PATIENCE = 5.0
-"""Seconds that a process has to end before it is killed."""
 
 
 class Group(Params):
@@ -130,70 +123,27 @@ def load(path: Path, out: Path) -> list[Run]:
     return sorted(runs, key=lambda run: run.settings.seed)
 
 
-def work_off(runs: list[Run], workers: int, report: Callable[[list[Run]], None]) -> None:
-    """Train what is not finished, ``workers`` runs at a time, each in a process with one thread.
+def shard(runs: list[Run], index: int, count: int) -> list[Run]:
+    """Every ``count``-th run from ``index`` (from 0) on, so that as many drivers share a sweep."""
+    return runs[index::count]
 
-    If this is interrupted, the processes end too; the runs go on with the next call.
+
+def work_off(runs: list[Run], engine: Launcher, report: Callable[[list[Run]], None]) -> None:
+    """Train what is not finished.
+
+    If this is interrupted, the trainings end too; the runs go on with the next call.
 
     Args:
         runs: of `load`.
-        workers: processes.
+        engine: where they are trained.
         report: called every few seconds with all runs.
 
     Raises:
         HipgError: what the first run raised that failed; the others end first.
     """
-    waiting = [run for run in runs if not run.finished]
-    training: dict[int, _Training] = {}
-    failed: list[HipgError] = []
-    try:
-        while waiting or training:
-            while waiting and len(training) < workers:
-                started = _Training(waiting.pop(0))
-                training[started.process.sentinel] = started
-            for sentinel in connection.wait(list(training), _LOOK_EVERY):
-                failed += training.pop(cast(int, sentinel)).failure()
-            report(runs)
-    finally:
-        for left in training.values():
-            left.end()
-    if failed:
-        raise failed[0]
-
-
-class _Training:
-    """A run in a process of its own."""
-
-    def __init__(self, run: Run) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._run = run
-        self._ear, mouth = context.Pipe(duplex=False)
-        self.process = context.Process(
-            target=_train, args=(run.settings, run.out, run.command, mouth), daemon=True
-        )
-        os.environ["PYTHONSAFEPATH"] = "1"  # its modules are not taken from the working folder
-        # Ctrl-C is for this process, which ends the other one
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
-        try:
-            self.process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        mouth.close()
-
-    def failure(self) -> list[HipgError]:
-        """What it raised, once it has ended; nothing, if it ended well."""
-        self.process.join()
-        try:
-            return [HipgError(f"{self._run.out}: {self._ear.recv()}")]
-        except EOFError:
-            code = self.process.exitcode
-            return [] if code == 0 else [HipgError(f"{self._run.out}: the training ended with code {code}")]
-
-    def end(self) -> None:
-        """End it now; its checkpoint is whole."""
-        self.process.terminate()
-        self.process.join(_PATIENCE)
-        self.process.kill()
+    by_folder = {run.out: run for run in runs}
+    jobs = [Job(run.out, _train, (run.settings, run.out, run.command)) for run in runs]
+    launchers.work_off(jobs, engine, lambda job: by_folder[job.folder].finished, lambda: report(runs))
 
 
 def standings(runs: list[Run], now: float) -> list[Standing]:
@@ -247,13 +197,9 @@ def _runs(group: Group, out: Path) -> Iterator[Run]:
         yield Run(settings, folder, " ".join(["hipg-bench train", *options, f"--out {folder}"]), labelled)
 
 
-def _train(settings: AnySettings, out: Path, command: str, mouth: Connection) -> None:
-    processes.leave_out_the_working_folder()
+def _train(settings: AnySettings, out: Path, command: str) -> None:
     torch.set_num_threads(1)
-    try:
-        train(settings, out, command=command, report=_stop_when_orphaned)
-    except HipgError as error:
-        mouth.send(str(error))
+    train(settings, out, command=command, report=_stop_when_orphaned)
 
 
 def _stop_when_orphaned(iteration: int, log: dict[str, float]) -> None:
