@@ -152,7 +152,7 @@ def test_a_file_that_holds_no_networks_is_refused(content: bytes, tmp_path: Path
 
 def test_a_critic_of_each_ones_own_cannot_be_asked(tmp_path: Path) -> None:
     train(recommended("coop_nav-3", algorithm="local", **SMALL), tmp_path, command="test")
-    with pytest.raises(HipgError, match="local critic"):
+    with pytest.raises(HipgError, match="critic of the joint state"):
         audit.load(tmp_path / "learner.safetensors")
 
 
@@ -170,7 +170,8 @@ def test_the_gradients_noise_is_that_of_a_plain_loop() -> None:
     trainer.critic.load_state_dict(critic.state_dict())
     data = trainer.roll_out()
     with torch.no_grad():
-        value, target = trainer.value_targets(data)
+        inputs = trainer.credit_inputs(data)
+    value, target = inputs.value, inputs.target
     live = data.health > 0
     traces = []
     for baseline in (torch.zeros_like(value), value):

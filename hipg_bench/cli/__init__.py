@@ -32,6 +32,7 @@ from hipg_bench.cli import (
     leaderboard,
     media,
     rollout,
+    settings,
     submit,
     suite,
     tasks,
@@ -90,6 +91,7 @@ app.command()(evaluate.evaluate)
 app.command()(compare.compare)
 app.command()(export.export)
 app.command()(train.train)
+app.command()(settings.settings)
 app.command()(collect.collect)
 app.command()(figures.figures)
 app.command()(media.video)

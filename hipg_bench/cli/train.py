@@ -37,14 +37,25 @@ def train(
     ] = None,
     num_agents: NumAgentsOption = None,
     algorithm: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--algorithm",
             "--algo",
-            help="MAPPO with one of the credit rules min_health, central (also called mappo) or local "
-            "(also called ippo); or maddpg, or qmix.",
+            help="MAPPO with one of the credit rules min_health, central (also called mappo), local (also "
+            "called ippo), coma, difference_rewards or ma_poca; or maddpg, or qmix. [default: min_health]",
         ),
-    ] = "min_health",
+    ] = None,
+    credit: Annotated[
+        str | None,
+        typer.Option(help="MAPPO with your own credit rule, as module:function, instead of --algorithm."),
+    ] = None,
+    settings_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--settings",
+            help="TOML file of settings that differ from the preset's, such as `hipg-bench settings` prints.",
+        ),
+    ] = None,
     preset: Annotated[str, typer.Option(help="Preset of settings: recommended or paper.")] = "recommended",
     seed: Annotated[int, typer.Option(min=0, max=999, help="Random seed.")] = 0,
     steps: Annotated[
@@ -105,25 +116,31 @@ def train(
 
     import torch
 
-    from hipg_bench.learning.settings import ALGORITHMS, PRESETS, SYNONYMS
+    from hipg_bench.learning.settings import PRESETS, SYNONYMS, read_settings, settings_type
 
     torch.set_num_threads(threads)
     if preset not in PRESETS:
         raise SpecError(f"no preset {preset!r}{hint(preset, PRESETS)}")
+    given = {} if settings_file is None else read_settings(settings_file)
+    algorithm = _algorithm(algorithm, credit, given)
     algorithm = SYNONYMS.get(algorithm, algorithm)
-    if algorithm not in ALGORITHMS:
-        raise SpecError(f"no algorithm {algorithm!r}{hint(algorithm, [*ALGORITHMS, *SYNONYMS])}")
-    pairs = [
-        pair for pair in setting or [] if pair.partition("=")[0] not in ALGORITHMS[algorithm].model_fields
-    ]
-    spec = _task(str(task), num_agents, pairs, ALGORITHMS[algorithm].model_fields)
+    fields = settings_type(algorithm).model_fields
+    pairs = [pair for pair in setting or [] if pair.partition("=")[0] not in fields]
+    spec = _task(str(task), num_agents, pairs, fields)
     own = [pair for pair in setting or [] if pair not in pairs]
-    changes: dict[str, Any] = {"algorithm": algorithm, "seed": seed, **parse_pairs(own)}
+    plain = PRESETS[preset](spec.task, algorithm=algorithm).model_dump(mode="json")
+    given = {name: value for name, value in given.items() if name not in plain or value != plain[name]}
+    changes: dict[str, Any] = {**given, "algorithm": algorithm, "seed": seed, **parse_pairs(own)}
     if steps is not None:
         changes["steps"] = steps
     settings = PRESETS[preset](spec.task, **changes)
     folder = out or Path("runs") / "-".join(
-        [spec.task, algorithm, *([preset] if preset != "recommended" else []), f"seed{seed}"]
+        [
+            spec.task,
+            algorithm.replace(":", "."),
+            *([preset] if preset != "recommended" else []),
+            f"seed{seed}",
+        ]
     )
     options = [
         f"--task {quoted(str(task))}",
@@ -131,10 +148,24 @@ def train(
         f"--algorithm {algorithm}",
         f"--preset {preset}",
         f"--seed {seed}",
+        *(f"--set {quoted(f'{name}={json.dumps(value)}')}" for name, value in given.items()),
         *(f"--set {quoted(pair)}" for pair in setting or []),
     ]
     command = " ".join(["hipg-bench train", *options, f"--steps {settings.steps}", f"--out {quoted(folder)}"])
     _train_one(settings, folder, command, tuple(track or ()))
+
+
+def _algorithm(algorithm: str | None, credit: str | None, given: dict[str, Any]) -> str:
+    """The algorithm that options or a settings file name, by default min_health.
+
+    Raises:
+        SpecError: --credit is given beside --algorithm, or is not module:function.
+    """
+    if credit is None:
+        return algorithm or str(given.get("algorithm", "min_health"))
+    if algorithm is not None or ":" not in credit:
+        raise SpecError(f"--credit takes module:function, without --algorithm beside it, got {credit!r}")
+    return credit
 
 
 def _task(task: str, num_agents: int | None, pairs: list[str], settings: Collection[str]) -> TaskSpec:

@@ -25,7 +25,8 @@ from torch import Tensor
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import HipgError
 from hipg_bench.learning import checkpoint
-from hipg_bench.learning.credit import with_each_dead
+from hipg_bench.learning.credit.min_health import with_each_dead
+from hipg_bench.learning.critics import StateCritic
 from hipg_bench.learning.mappo import networks
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
@@ -179,11 +180,13 @@ def load(path: Path) -> tuple[Actor, Critic, Settings]:
     try:
         settings = parse(Settings, json.loads(text), str(source))
         spec = task_spec(settings.task)
-        if settings.algorithm == "local":
-            raise HipgError(
-                f"{path}: a local critic cannot be asked about the health of others (algorithm local)"
-            )
+        if ":" in settings.algorithm:  # finding it would run code that a file names
+            raise HipgError(f"{path}: networks of own credit rules are not audited ({settings.algorithm})")
         actor, critic = networks(settings, family_of(spec).layout, clips=spec.clip_actions)
+        if type(critic) is not StateCritic:
+            raise HipgError(
+                f"{path}: an audit needs a critic of the joint state (algorithm {settings.algorithm})"
+            )
         actor.load_state_dict(tensors["actor"])
         critic.load_state_dict(tensors["critic"])
     except (json.JSONDecodeError, KeyError, RuntimeError) as error:

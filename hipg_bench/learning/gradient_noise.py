@@ -15,9 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hipg_bench.learning import credit
-from hipg_bench.learning.mappo import Rollout, Trainer
+from hipg_bench.learning.credit.central import central
+from hipg_bench.learning.credit.min_health import min_health
+from hipg_bench.learning.mappo import Trainer
 from hipg_bench.learning.networks import Actor, Critic
+from hipg_bench.learning.rollout import Rollout
 from hipg_bench.learning.settings import Settings
 from hipg_bench.registry import task_spec
 
@@ -57,7 +59,7 @@ def gradient_noise(
         seed: of the episodes and of all random numbers.
     """
     whole = {"rollout": task_spec(settings.task).horizon, "num_envs": worlds, "seed": seed}
-    trainer = Trainer(settings.model_copy(update={**whole, "forks": 0.0, "spontaneous_deaths": 0.0}))
+    trainer = Trainer(settings.model_copy(update=whole))
     trainer.actor.load_state_dict(actor.state_dict())
     trainer.critic.load_state_dict(critic.state_dict())
     data = trainer.roll_out()
@@ -84,18 +86,16 @@ def gradient_noise(
 @torch.no_grad()
 def _weights(trainer: Trainer, data: Rollout) -> dict[str, Float[Tensor, "T B N"]]:
     """Psi under each baseline, in units of reward, with zero mean over the live samples."""
-    value, target = trainer.value_targets(data)
-    health = data.health.flatten(0, 1)
-    target = target.flatten(0, 1)
+    inputs = trainer.credit_inputs(data)
     psi = {
-        "none": credit.advantage(target, torch.zeros_like(target), health),
-        "central": credit.advantage(target, value.flatten(0, 1), health),
-        "min_health": credit.min_health(target, trainer.value_without_each(data), health),
+        "none": inputs.target,
+        "central": central.psi(inputs),
+        "min_health": min_health.psi(inputs),
     }
-    live = health > 0
+    live = data.health > 0
     return {
-        name: torch.where(live, each - each[live].mean(), 0.0).view_as(data.health)
-        for name, each in psi.items()
+        name: torch.where(live, each - each[live].mean(), 0.0)
+        for name, each in ((name, data.health * each) for name, each in psi.items())
     }
 
 

@@ -241,10 +241,9 @@ class Actor(nn.Module):
 
 
 class Critic(nn.Module):
-    """A value function of what it is shown and of the share of the horizon that has passed.
+    """A value function of F observed numbers and of the elapsed share of the horizon.
 
-    It is shown the joint state, or each agent's observation (the algorithm ``local``), F numbers either
-    way, and predicts returns normalised by their running mean and deviation.
+    It predicts returns normalised by their running mean and deviation.
     """
 
     def __init__(
@@ -255,11 +254,13 @@ class Critic(nn.Module):
         *,
         normalize: bool = True,
         normalize_returns: bool = True,
+        further: int = 0,
     ) -> None:
+        """Make a value function; ``further`` numbers of its input come unnormalised, behind `inputs`."""
         super().__init__()
         self.norm = RunningNorm(size, health_columns if normalize else np.arange(size))
         self.returns = RunningNorm(1, None if normalize_returns else np.arange(1))
-        self.body = mlp((size + 1, *hidden, 1), nn.ELU, 1.0)
+        self.body = mlp((size + 1 + further, *hidden, 1), nn.ELU, 1.0)
 
     def inputs(self, seen: Float[Tensor, "... F"], elapsed: Float[Tensor, "..."]) -> Float[Tensor, "... I"]:
         """What the network itself is fed, I = F + 1 numbers."""

@@ -167,7 +167,7 @@ class ReplayTrainer(abc.ABC):
     def __init__(self, settings: ReplaySettings, folder: Path) -> None:
         """Make the worlds; the replay is kept in ``folder``."""
         torch.manual_seed(settings.seed)
-        self.settings = settings
+        self.settings, self._folder = settings, folder
         self.env: BatchEnv = make(
             settings.task,
             settings.num_envs,
@@ -213,6 +213,16 @@ class ReplayTrainer(abc.ABC):
     @abc.abstractmethod
     def learned(self) -> dict[str, Any]:
         """Everything else that a checkpoint holds: what has a ``state_dict``, by name."""
+
+    def start(self) -> None:  # noqa: B027  nothing to do is right
+        """A new run needs no preparation."""
+
+    def save_networks(self, path: Path) -> None:  # noqa: B027
+        """There is nothing to audit."""
+
+    def finish(self) -> None:
+        """Remove the replay: a finished run is not resumed."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def iterate(self) -> dict[str, float]:
         """T steps of every world, and the updates that fall due on the way. Returns what to log."""

@@ -6,10 +6,10 @@ import contextlib
 import csv
 import dataclasses
 import hashlib
+import importlib
 import io
 import json
 import platform
-import shutil
 import time
 from collections.abc import Callable
 from importlib import metadata
@@ -21,7 +21,7 @@ import torch
 
 from hipg_bench.claims import Claim
 from hipg_bench.errors import HipgError, ResumeError
-from hipg_bench.learning import mappo, periodic_evaluation, torch_setup
+from hipg_bench.learning import periodic_evaluation, torch_setup
 from hipg_bench.learning.settings import AnySettings, MaddpgSettings, QmixSettings, Settings
 from hipg_bench.learning.trackers import check_services, open_trackers, tag
 from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
@@ -48,6 +48,10 @@ class Learner(Protocol):
 
     iteration: int
 
+    def start(self) -> None:
+        """Prepare a run that is not resumed."""
+        ...
+
     def iterate(self) -> Log:
         """Play and learn. Returns what to log."""
         ...
@@ -64,6 +68,14 @@ class Learner(Protocol):
         """Write the policy file, whole or not at all."""
         ...
 
+    def save_networks(self, path: Path) -> None:
+        """Write what an audit needs, whole or not at all, if there is such."""
+        ...
+
+    def finish(self) -> None:
+        """Remove what only an unfinished run needs."""
+        ...
+
 
 def new_learner(settings: AnySettings, out: Path) -> Learner:
     """Make the settings' learner; what it keeps on disk beside checkpoints lies in ``out / "replay"``.
@@ -72,21 +84,14 @@ def new_learner(settings: AnySettings, out: Path) -> Learner:
         HipgError: it is built on TorchRL, which is not installed.
     """
     try:
-        if isinstance(settings, MaddpgSettings):
-            from hipg_bench.learning import maddpg
-
-            return maddpg.Trainer(settings, out / _REPLAY)
-        if isinstance(settings, QmixSettings):
-            from hipg_bench.learning import qmix
-
-            return qmix.Trainer(settings, out / _REPLAY)
+        module = importlib.import_module(f"hipg_bench.learning.{settings.learner}")
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in ("torchrl", "tensordict"):
             raise
         raise HipgError(
             f"algorithm {settings.algorithm!r} needs TorchRL: pip install 'hipg-bench[torchrl]'"
         ) from error
-    return mappo.Trainer(settings)
+    return module.Trainer(settings, out / _REPLAY)
 
 
 def train(
@@ -183,8 +188,8 @@ def _train_alone(
         check_seal(curve)
         learner.resume(checkpoint)
         rows = _read_curve(curve, learner.iteration)
-    elif isinstance(learner, mappo.Trainer) and learner.settings.initial_policy:
-        learner.start_from_policy(Path(learner.settings.initial_policy))
+    else:
+        learner.start()
     before = float(rows[-1]["seconds"]) if rows else 0.0
     worlds = periodic_evaluation.PeriodicEvaluation(settings.task, threads=torch.get_num_threads())
     started = time.monotonic()
@@ -207,13 +212,11 @@ def _train_alone(
             if report is not None:
                 report(learner.iteration, log)
             # the checkpoint goes last: what it says was done is then on disk
-            if isinstance(learner, mappo.Trainer):
-                learner.save_networks(out / "learner.safetensors")
+            learner.save_networks(out / "learner.safetensors")
             write_text(curve, _table(rows), sealed=True)
             write_text(out / RECORD, _record(settings, command, steps, seconds))
             learner.save(checkpoint)
-    if not isinstance(learner, mappo.Trainer):
-        shutil.rmtree(out / _REPLAY, ignore_errors=True)
+    learner.finish()
 
 
 def _check_same_task(task: str, out: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import pydantic
 
+from hipg_bench.documents import read_toml
 from hipg_bench.errors import ResumeError, SpecError, hint
 from hipg_bench.registry import task_spec
 from hipg_bench.spec import Params, parse
@@ -17,6 +19,13 @@ Widths = Annotated[
     tuple[Annotated[int, pydantic.Field(ge=1, le=8192)], ...], pydantic.Field(min_length=1, max_length=32)
 ]
 """Of hidden layers."""
+
+
+CREDIT_RULES = tuple(
+    sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent / "credit")]))
+)
+"""MAPPO's credit rules: the files of `hipg_bench.learning.credit`."""
+_RULE = rf"^({'|'.join(CREDIT_RULES)}|[A-Za-z_][\w.]*:[A-Za-z_]\w*)$"
 
 
 class RunSettings(Params):
@@ -34,6 +43,9 @@ class RunSettings(Params):
         eval_every: environment steps between two periodic evaluations of the policy, which do not change
             the run; 0 evaluates it at the end only.
     """
+
+    learner: ClassVar[str]
+    """Module of `hipg_bench.learning` whose ``Trainer`` these are for, and table of the presets."""
 
     task: str
     seed: int = pydantic.Field(default=0, ge=0, le=999)
@@ -82,7 +94,7 @@ class Settings(RunSettings):
     """Everything that defines a MAPPO run.
 
     Attributes:
-        algorithm: how credit is assigned, a function of `hipg_bench.learning.credit`.
+        algorithm: how credit is assigned: a rule of `hipg_bench.learning.credit`, or ``module:function``.
         epochs, minibatches: passes over a rollout, and parts each is cut into.
         gae_lambda: GAE's lambda.
         clip: PPO's epsilon.
@@ -105,6 +117,9 @@ class Settings(RunSettings):
             width); none: it is an MLP of the whole observation.
         mask_dead: dead agents' samples take no part in the actor's update; else only the algorithm
             ``min_health`` leaves them without weight, as in the authors' code.
+        mask_dead_values: values of dead agents are not trained, where a critic has one for each agent
+            (``local``, ``difference_rewards``); else they are.
+        credit_samples: actions that ``coma`` draws for each expectation.
         zero_dead_actions: a dead agent's action is stored as zeros beside the log-probability of what
             it had drawn, a quirk of the authors' code; matters only where the dead are not masked.
         dead_observation: what a dead agent's row of the observation holds in training: ``blank``, its health
@@ -117,13 +132,11 @@ class Settings(RunSettings):
         normalize_inputs, normalize_returns: running normalisation of what networks see, of value targets.
         bootstrap_truncation: an episode cut by the horizon goes on in its value target; else the
             horizon counts as an end, as in the authors' code.
-        spontaneous_deaths: agents per episode, in the mean, that die without a cause, in training only,
-            so that the critic meets the states its counterfactual is about.
-        forks: worlds beside the rollout's in which an agent was killed, as a share of ``num_envs``; only
-            the critic learns from them (`hipg_bench.learning.forks`).
     """
 
-    algorithm: Literal["min_health", "central", "local"] = "min_health"
+    learner: ClassVar[str] = "mappo"
+
+    algorithm: str = pydantic.Field(default="min_health", pattern=_RULE)
     epochs: int = pydantic.Field(default=5, ge=1, le=100)
     minibatches: int = pydantic.Field(default=4, ge=1, le=1000)
     gae_lambda: float = pydantic.Field(default=0.95, ge=0, le=1)
@@ -140,6 +153,8 @@ class Settings(RunSettings):
     critic_hidden: Widths = (256, 256)
     attention_groups: tuple[str, ...] = ()
     mask_dead: bool = True
+    mask_dead_values: bool = False
+    credit_samples: int = pydantic.Field(default=8, ge=1, le=256)
     zero_dead_actions: bool = False
     dead_observation: Literal["blank", "live"] = "blank"
     advantage_norm: Literal["live", "batch", "minibatch"] = "live"
@@ -147,8 +162,6 @@ class Settings(RunSettings):
     normalize_inputs: bool = True
     normalize_returns: bool = True
     bootstrap_truncation: bool = True
-    spontaneous_deaths: float = pydantic.Field(default=0.0, ge=0, le=10)
-    forks: float = pydantic.Field(default=0.0, ge=0, le=1)
 
 
 class ReplaySettings(RunSettings):
@@ -199,6 +212,8 @@ class MaddpgSettings(ReplaySettings):
             not clip actions.
     """
 
+    learner: ClassVar[str] = "maddpg"
+
     algorithm: Literal["maddpg"] = "maddpg"
     critic_hidden: Widths = (256, 256)
     critic_sees: Literal["state", "observations"] = "state"
@@ -220,6 +235,8 @@ class QmixSettings(ReplaySettings):
         epsilon_steps: environment steps until then.
     """
 
+    learner: ClassVar[str] = "qmix"
+
     algorithm: Literal["qmix"] = "qmix"
     gamma: float = pydantic.Field(default=0.9, ge=0, le=1)
     learning_starts: int = pydantic.Field(default=2000, ge=1)
@@ -235,51 +252,28 @@ class QmixSettings(ReplaySettings):
 AnySettings = Settings | MaddpgSettings | QmixSettings
 
 ALGORITHMS: Mapping[str, type[Settings] | type[MaddpgSettings] | type[QmixSettings]] = {
-    "min_health": Settings,
-    "central": Settings,
-    "local": Settings,
-    "maddpg": MaddpgSettings,
-    "qmix": QmixSettings,
-}
-"""Settings of each algorithm."""
+    **dict.fromkeys(CREDIT_RULES, Settings), "maddpg": MaddpgSettings, "qmix": QmixSettings,
+}  # fmt: skip
+"""Settings of each algorithm: MAPPO's, by its credit rule, or another learner's."""
 SYNONYMS: Mapping[str, str] = {"mappo": "central", "ippo": "local"}
 """Other names that the field uses."""
 
-
 _EPISODES_PER_EVALUATION = 1000
 """Training episodes between two periodic evaluations, which take 3 % of the time or less."""
-_BY_FAMILY: Mapping[str, dict[str, Any]] = {
-    # what a drone does shows in the team's distances at once: a short trace has less of the other agents'
-    # randomness
-    "hazard_nav": {
-        "steps": 3_000_000, "minibatches": 8, "gamma": 0.9, "gae_lambda": 0.9, "entropy_coef": 0.008,
-        # one way of looking at every point: what an MLP has to learn for each of them separately
-        "attention_groups": ("point", "neighbor"), "actor_hidden": (32, 128),
-    },
-    # reward is so rare at first that noise would collapse exploration without a strong bonus
-    "hazard_comm": {
-        "epochs": 4, "minibatches": 8, "entropy_coef": 0.01,
-        "attention_groups": ("neighbor", "wreck"), "actor_hidden": (32, 128),
-    },
-    "multiwalker": {
-        "steps": 12_000_000, "num_envs": 512, "rollout": 32, "minibatches": 6, "gamma": 0.99,
-        "entropy_coef": 0.001, 
-        "initial_std": 0.3,  # teams that fall less often learn to stand in a fifth of the steps
-        "weights": {"alive": 0.1},  # without it teams learn to dive before they learn to stand
-    },
-}  # fmt: skip
-"""Where a family does better with other values than the defaults."""
-_WALKERS_REPLAYED: dict[str, Any] = {
-    "steps": 3_000_000, "update_every": 25, "weights": {"alive": 0.1}, "eval_every": 200_000,
-}  # fmt: skip
-_MADDPG_BY_FAMILY: Mapping[str, dict[str, Any]] = {
-    "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.99, "noise_steps": 1_000_000},
-}
-_QMIX_BY_FAMILY: Mapping[str, dict[str, Any]] = {
-    # a longer view, faster targets or slower exploration, and the best of 12 choices at once is so
-    # overestimated that values grow without bound
-    "multiwalker": {**_WALKERS_REPLAYED, "gamma": 0.95, "tau": 0.005},
-}
+
+
+def settings_type(algorithm: str) -> type[Settings] | type[MaddpgSettings] | type[QmixSettings]:
+    """What defines a run of an algorithm; ``module:function`` is a credit rule from outside.
+
+    Raises:
+        SpecError: no such algorithm.
+    """
+    algorithm = SYNONYMS.get(algorithm, algorithm)
+    if ":" in algorithm:
+        return Settings
+    if algorithm not in ALGORITHMS:
+        raise SpecError(f"no algorithm {algorithm!r}{hint(algorithm, [*ALGORITHMS, *SYNONYMS])}")
+    return ALGORITHMS[algorithm]
 
 
 def recommended(task: str, **changes: Any) -> AnySettings:
@@ -289,88 +283,64 @@ def recommended(task: str, **changes: Any) -> AnySettings:
         UnknownNameError: no such task.
         SpecError: no such algorithm, or a setting that is not allowed.
     """
-    family, algorithm = task_spec(task).family, _algorithm(changes)
-    by_family = {"maddpg": _MADDPG_BY_FAMILY, "qmix": _QMIX_BY_FAMILY}.get(algorithm, _BY_FAMILY)
-    return _parsed(task, algorithm, {**by_family.get(family, {}), **changes})
-
-
-def _algorithm(changes: Mapping[str, Any]) -> str:
-    """The algorithm's own name, where one of its synonyms may have been given."""
-    name = str(changes.get("algorithm", "min_health"))
-    return SYNONYMS.get(name, name)
-
-
-def _parsed(task: str, algorithm: str, values: dict[str, Any]) -> AnySettings:
-    if algorithm not in ALGORITHMS:
-        near = hint(algorithm, [*ALGORITHMS, *SYNONYMS])
-        raise SpecError(f"training {task}: no algorithm {algorithm!r}{near}")
-    every = _EPISODES_PER_EVALUATION * task_spec(task).horizon
-    return parse(
-        ALGORITHMS[algorithm],
-        {"task": task, "eval_every": every, **values, "algorithm": algorithm},
-        f"training {task}",
-    )
-
-
-_PAPER: dict[str, Any] = {
-    "steps": 2_500_000, "epochs": 8, "minibatches": 8, "gamma": 0.95, "gae_lambda": 1.0, "entropy_coef": 0.01,
-    "critic_rate": 5e-3, "target_kl": None, "max_grad_norm": 0.5, "initial_std": 1.0,
-    "actor_hidden": (64, 64), "critic_hidden": (64,) * 8,
-    "mask_dead": False, "zero_dead_actions": True, "advantage_norm": "minibatch", "value_clip": 0.2,
-    "normalize_inputs": False, "normalize_returns": False, "bootstrap_truncation": False,
-}  # fmt: skip
-_PAPER_ALGORITHMS: Mapping[str, dict[str, Any]] = {
-    "local": {"critic_hidden": (64, 64), "critic_rate": 1e-3},
-    "central": {},
-    "min_health": {"advantage_norm": "batch"},
-}
-_PAPER_WALKERS: dict[str, Any] = {
-    "steps": 5_000_000, "num_envs": 128, "rollout": 128, "epochs": 32, "minibatches": 4, "gamma": 0.99,
-    "entropy_coef": 0.0, "clip": 0.3, "actor_rate": 3e-4, "critic_rate": 3e-4, "value_clip": 10.0,
-    "max_grad_norm": 1e6,
-}  # fmt: skip
-
-
-_PAPER_MADDPG: dict[str, Any] = {
-    "steps": 2_500_000, "gamma": 0.95, "batch": 1024, "buffer": 1_000_000, "learning_starts": 51_200,
-    "update_every": 100, "rate": 1e-2, "max_grad_norm": 0.5, "tau": 0.01, "hidden": (64, 64),
-    "critic_hidden": (64, 64), "critic_sees": "observations", "pretanh_l2": 1e-3,
-    "mask_dead": False, "normalize_inputs": False,
-}  # fmt: skip
-_PAPER_QMIX: dict[str, Any] = {
-    "steps": 5_000_000, "gamma": 0.99, "batch": 100, "buffer": 100_000, "learning_starts": 1000,
-    "update_every": 100, "rate": 5e-4, "max_grad_norm": 10.0, "tau": 0.2, "hidden": (64, 64),
-    "bins": 8, "mixer_width": 32, "epsilon": 0.02, "epsilon_steps": 10_000,
-    "mask_dead": False, "normalize_inputs": False,
-}  # fmt: skip
+    return _preset("recommended", task, changes)
 
 
 def paper(task: str, **changes: Any) -> AnySettings:
     """The paper's settings, with the quirks of the authors' code, with some changed.
 
-    Source: facts sheet, section 5 (particles) and section 6c (walkers, where gamma, lambda, clip and
-    value clip are not stated and RLlib's defaults of the time are taken). The critic is told the share
-    of the horizon that has passed where the authors feed the number of steps left.
-
-    Of MADDPG the sheet gives everything but the learning rate, which is the default of the authors' code;
-    its soft choice among five directions is a continuous push here, with Gaussian noise. Of QMIX the
-    paper states the number of bins alone; the rest are RLlib's defaults of the time, where an update is of
-    one whole episode (about 100 steps here) and follows each episode, but without recurrence, and with
-    targets that follow smoothly where RLlib copies them every 500 steps.
+    Their sources are in ``presets/paper.toml``.
 
     Raises:
         UnknownNameError: no such task.
         SpecError: no such algorithm, or a setting that is not allowed.
     """
-    spec, algorithm = task_spec(task), _algorithm(changes)
-    if algorithm == "maddpg":
-        action_scale = 1.0 if spec.clip_actions else 5.0
-        return _parsed(task, algorithm, {**_PAPER_MADDPG, "action_scale": action_scale, **changes})
-    if algorithm == "qmix":
-        return _parsed(task, algorithm, {**_PAPER_QMIX, **changes})
-    walkers = _PAPER_WALKERS if spec.family == "multiwalker" else {}
-    return _parsed(task, algorithm, {**_PAPER, **walkers, **_PAPER_ALGORITHMS.get(algorithm, {}), **changes})
+    return _preset("paper", task, changes)
 
 
 PRESETS: Mapping[str, Callable[..., AnySettings]] = {"recommended": recommended, "paper": paper}
 """Ready-made settings by name."""
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Some settings from a TOML file, such as `to_toml` writes; ``"none"`` is no value.
+
+    Raises:
+        SpecError: it cannot be read.
+    """
+    return {name: None if value == _NONE else value for name, value in read_toml(path).items()}
+
+
+def to_toml(settings: AnySettings) -> str:
+    """All settings of a run but its task and seed, as a TOML file that `read_settings` takes."""
+    lines: list[str] = []
+    for name, value in settings.model_dump(mode="json").items():
+        if isinstance(value, dict):
+            pairs = cast(dict[str, Any], value).items()
+            text = "{" + ", ".join(f" {key} = {json.dumps(one)}" for key, one in pairs) + " }"
+        else:
+            text = json.dumps(_NONE if value is None else value)
+        if name not in ("task", "seed"):
+            lines.append(f"{name} = {text}")
+    return "\n".join(lines) + "\n"
+
+
+_NONE = "none"
+
+
+def _preset(name: str, task: str, changes: Mapping[str, Any]) -> AnySettings:
+    """A preset's tables for a task and algorithm, one over the other, under what is changed."""
+    spec = task_spec(task)
+    algorithm = str(changes.get("algorithm", "min_health"))
+    algorithm = SYNONYMS.get(algorithm, algorithm)
+    kind = settings_type(algorithm)
+    tables = read_settings(Path(__file__).parent / "presets" / f"{name}.toml").get(kind.learner, {})
+    values: dict[str, Any] = {"task": task, "eval_every": _EPISODES_PER_EVALUATION * spec.horizon}
+    for table in (
+        tables.get("all", {}),
+        tables.get("family", {}).get(spec.family, {}),
+        tables.get("algorithm", {}).get(algorithm, {}),
+        tables.get("task", {}).get(task, {}),
+    ):
+        values |= {key: None if value == _NONE else value for key, value in table.items()}
+    return parse(kind, {**values, **changes, "algorithm": algorithm}, f"training {task}")
