@@ -9,6 +9,8 @@ import numpy as np
 from dm_control import viewer
 
 import hipg_bench
+from hipg_bench.errors import RenderError
+from hipg_bench.rendering.viewer import check_display
 
 
 def policy(time_step: dm_env.TimeStep) -> list[np.ndarray]:
@@ -24,4 +26,8 @@ def fly(seen: dict[str, np.ndarray]) -> np.ndarray:
 
 
 if __name__ == "__main__":
+    try:
+        check_display()
+    except RenderError as error:
+        raise SystemExit(str(error)) from None
     viewer.launch(hipg_bench.load("hazard_nav", "4", task_kwargs={"random": 0}), policy)

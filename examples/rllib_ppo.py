@@ -8,6 +8,7 @@ import argparse
 import ray
 from ray.rllib.algorithms.ppo import PPOConfig
 
+import hipg_bench
 from hipg_bench.adapters.rllib import HipgMultiAgentEnv
 
 
@@ -37,7 +38,8 @@ def main() -> None:
         for iteration in range(args.iterations):
             played = algorithm.train()["env_runners"]
             # RLlib adds up what the agents got: each is paid the team's reward while it lives
-            print(f"iteration {iteration}: return {played['episode_return_mean']:.2f}", flush=True)
+            mean = played["episode_return_mean"] / hipg_bench.task_spec(args.task).num_agents
+            print(f"iteration {iteration}: mean return of an agent {mean:.2f}", flush=True)
         algorithm.stop()
     finally:
         ray.shutdown()

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from jaxtyping import Float, UInt8
 
-from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action, told_horizon
+from hipg_bench.adapters.joint import check_drawing, joint_info, joint_spaces, split_action, told_horizon
 from hipg_bench.arguments import MOST_SEED, whole
 from hipg_bench.env import Step
 from hipg_bench.errors import RenderError
@@ -42,6 +42,7 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             UnknownNameError, SpecError, RenderError: an argument that is not allowed.
         """
+        check_drawing(str(task) if isinstance(task, str) else task.task, overrides)
         self._env = env = make(task, 1, seed, threads=1, autoreset=False, **overrides)
         self.task_spec, self.render_mode = env.spec, render_mode
         self._spec: EnvSpec | None = None
@@ -49,7 +50,8 @@ class HipgEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, "rgb_array"):
             raise RenderError(
                 f"{env.spec.task}: the render mode 'rgb_array' is allowed, got {render_mode!r}; "
-                f"`gymnasium.make(..., render_mode='human')` shows its pictures in a window"
+                f"`gymnasium.make(..., render_mode='human')` shows its pictures in a window, "
+                f"with pip install 'hipg-bench[gymnasium]'"
             )
         self._live = Live(env.spec, render_mode) if render_mode else None
         self.observation_space, self.action_space = joint_spaces(env)

@@ -14,10 +14,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float
 
-from hipg_bench.adapters.joint import joint_info, joint_spaces, split_action, told_horizon
+from hipg_bench.adapters.joint import check_drawing, joint_info, joint_spaces, split_action, told_horizon
 from hipg_bench.arguments import MOST_SEED, whole
 from hipg_bench.env import Step
-from hipg_bench.errors import HipgError, SpecError, hint
+from hipg_bench.errors import HipgError, RenderError, SpecError, hint
 from hipg_bench.registry import make
 from hipg_bench.spec import TaskSpec
 
@@ -38,6 +38,7 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         seed: int | None = None,
         threads: int = 0,
+        render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
         """Build the worlds.
@@ -48,11 +49,20 @@ class HipgVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             autoreset_mode: when a world goes on with its next episode.
             seed: of the first episodes, by default another each time; a reset with a seed replaces it.
             threads: physics threads; 0 for all cores. Results do not depend on it.
+            render_mode: None alone; many worlds are not drawn.
             **overrides: as for `hipg_bench.make`.
 
         Raises:
-            UnknownNameError, SpecError: an argument that is not allowed.
+            UnknownNameError, SpecError, RenderError: an argument that is not allowed.
         """
+        name = task if isinstance(task, str) else task.task
+        if render_mode is not None:
+            raise RenderError(
+                f"{name}: many worlds are not drawn, got render_mode={render_mode!r}: one is, by "
+                f"`gymnasium.make(..., render_mode='rgb_array')`, and so is each of several with "
+                f"`gymnasium.make_vec(..., vectorization_mode='sync', render_mode='rgb_array')`"
+            )
+        check_drawing(name, overrides)
         self._mode = _checked(autoreset_mode)
         at_once = self._mode is AutoresetMode.SAME_STEP
         self._env = env = make(task, num_envs, seed, threads=threads, autoreset=at_once, **overrides)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from jaxtyping import Float
 
 from hipg_bench.arguments import numbers
 from hipg_bench.env import BatchEnv, Step
+from hipg_bench.errors import SpecError
+from hipg_bench.rendering.live import SIZE
 from hipg_bench.spec import TaskSpec
 
 
@@ -20,6 +23,21 @@ def joint_spaces(env: BatchEnv) -> tuple[Box, Box]:
     low, high = (np.tile(ends, env.num_agents) for ends in env.layout.observation.limits)
     seen = Box(low, high)
     return seen, Box(-1.0, 1.0, (env.num_agents * env.action_size,))
+
+
+def check_drawing(task: str, overrides: Mapping[str, Any]) -> None:
+    """Refuse sizes of pictures, which other environments of Gymnasium take, with what to do instead.
+
+    Raises:
+        SpecError: there is one.
+    """
+    for name in ("width", "height", "camera_name", "camera_id"):
+        if name in overrides:
+            width, height = SIZE
+            raise SpecError(
+                f"{task}: {name!r} is refused: pictures are {width} x {height}, from a camera that follows the "
+                f"team; `hipg-bench video --width` makes films of any size"
+            )
 
 
 def split_action(env: BatchEnv, action: Any, lead: tuple[int, ...]) -> Float[np.ndarray, "B N A"]:

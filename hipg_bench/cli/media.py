@@ -35,9 +35,16 @@ def video(
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,
     out: Annotated[Path | None, typer.Option(help="Output file, .mp4 or .gif.")] = None,
-    width: Annotated[int, typer.Option(min=64, help="Width in pixels.")] = 1280,
-    height: Annotated[int, typer.Option(min=64, help="Height in pixels.")] = 720,
-    fps: Annotated[int, typer.Option(min=1, max=120, help="Frames per second.")] = 30,
+    width: Annotated[
+        int | None, typer.Option(min=64, help="Width in pixels, by default 1280, of a GIF 480.")
+    ] = None,
+    height: Annotated[
+        int | None, typer.Option(min=64, help="Height in pixels, by default 9/16 of the width.")
+    ] = None,
+    fps: Annotated[
+        int | None,
+        typer.Option(min=1, max=120, help="Frames per second, by default 30, of a GIF 12."),
+    ] = None,
 ) -> None:
     """Play one episode and record a video."""
     from hipg_bench.evaluation.episodes import EvaluationJob
@@ -55,10 +62,20 @@ def video(
         states = job.record(spec, policy, row)
         bar = bars.add_task("film", total=None)
         film.record(
-            spec, states, path, agent=who.name, size=(width, height), fps=fps, end_reason=row["end_reason"],
+            spec, states, path, agent=who.name, size=_size(width, height), fps=fps,
+            end_reason=row["end_reason"],
             progress=lambda done, total: bars.update(bar, completed=done, total=total),
         )  # fmt: skip
     console.say(f"{path}: return {row['return']:.2f}, {row['deaths']} dead, {row['end_reason']}")
+
+
+def _size(width: int | None, height: int | None) -> tuple[int, int] | None:
+    """Width and height, where one of them may be left to the shape of a film; None where both are."""
+    if width is None and height is None:
+        return None
+    if width is None:
+        return 2 * round((height or 0) * 8 / 9), height or 0
+    return width, height or 2 * round(width * 9 / 32)
 
 
 def view(

@@ -24,6 +24,8 @@ from hipg_bench.rendering import film, gl
 from hipg_bench.spec import TaskSpec
 
 _AT_ONCE = 2
+_SIZE, _FPS = (960, 540), 24
+"""Of films, which take 25 to 32 s of one core each without a graphics card."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +157,10 @@ def _make_one(one: Film, stop: threading.Event, advance: Callable[[float], None]
 
     with np.load(one.saved, allow_pickle=False) as saved:
         rows = saved["rows"]
-    film.record(one.spec, rows, one.video, agent=one.agent, end_reason=one.end_reason, progress=progress)
+    film.record(
+        one.spec, rows, one.video, agent=one.agent, end_reason=one.end_reason, size=_SIZE, fps=_FPS,
+        progress=progress,
+    )  # fmt: skip
 
 
 def _is_of(saved: Path, row: Row) -> bool:

@@ -21,10 +21,11 @@ _WIDTH, _HEIGHT = 360.0, 96.0
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """A labelled place on an axis."""
+    """A labelled place on an axis, and its value."""
 
     x: float
     label: str
+    value: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,8 +92,8 @@ def _returns(spec: TaskSpec, rows: Sequence[Row]) -> Chart:
     high = max(values.max(), *anchors.values()) if anchors else values.max()
     span = max(high - low, 1e-9)
     counts, edges = np.histogram(values, _BINS, (low, low + span))
-    marks = [Mark(_WIDTH * (at - low) / span, name) for name, at in anchors.items()]
-    marks.append(Mark(_WIDTH * (values.mean() - low) / span, "mean"))
+    marks = [Mark(_WIDTH * (at - low) / span, name, f"{at:.1f}") for name, at in anchors.items()]
+    marks.append(Mark(_WIDTH * (values.mean() - low) / span, "mean", f"{values.mean():.1f}"))
     says = [
         f"{count} episodes in {a:.1f} .. {b:.1f}"
         for count, a, b in zip(counts, edges, edges[1:], strict=False)

@@ -41,7 +41,9 @@ class Board:
         self.root = root.resolve()
 
     def names(self) -> tuple[str, ...]:
-        """Names of the entries."""
+        """Names of the entries; a folder that is missing has none, and is not made."""
+        if not self.root.is_dir():
+            return ()
         with self._alone():
             return self._names()
 

@@ -44,6 +44,11 @@ class Line:
         return self.result["aggregate"]["score_iqm"]
 
     @property
+    def comparable(self) -> bool:
+        """Whether the score means something: a reference that is not made for all tasks is no entry that failed."""
+        return self.view.kind != "reference" or self.played == self.tasks
+
+    @property
     def ci95(self) -> Sequence[float]:
         """Its 95 % interval."""
         return self.result["aggregate"]["score_iqm_ci95"]

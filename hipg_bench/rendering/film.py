@@ -32,6 +32,10 @@ from hipg_bench.spec import Params, TaskSpec
 _WIDEST, _FASTEST = 7680, 240
 FORMATS = (".mp4", ".gif")
 """By the ending of a film's name: H.264, or an animated picture."""
+DEFAULTS: Mapping[str, tuple[tuple[int, int], int]] = {".mp4": ((1280, 720), 30), ".gif": ((480, 270), 12)}
+"""Width and height, and frames per second, by format; GIFs of an episode then have 3 to 4 MB."""
+_MOST_GIF_BYTES = 400_000_000
+"""Of a GIF's frames that are kept in memory to find one palette for all, which halves the file."""
 
 _SHORT = 6.0
 """Episodes up to this long, s, are shown at half speed: drones are quick."""
@@ -82,8 +86,8 @@ def record(
     out: Path,
     *,
     agent: str,
-    size: tuple[int, int] = (1280, 720),
-    fps: int = 30,
+    size: tuple[int, int] | None = None,
+    fps: int | None = None,
     end_reason: str = "",
     backend: str | None = None,
     progress: Progress | None = None,
@@ -97,8 +101,8 @@ def record(
         rows: state rows of one world, the first of the episode up to its last.
         out: file to write, its ending one of `FORMATS`.
         agent: who plays, for the caption.
-        size: width and height, even numbers of pixels.
-        fps: frames per second.
+        size: width and height, even numbers of pixels; by default as `DEFAULTS` says for the format.
+        fps: frames per second; the same.
         end_reason: why the episode ended; the horizon is recognised without it.
         backend: OpenGL to use, by default the first that works.
         progress: told how far the film is.
@@ -111,6 +115,8 @@ def record(
     out = Path(out)
     if out.suffix.lower() not in FORMATS:
         raise RenderError(f"films end in {' or '.join(FORMATS)}, got {out.name!r}")
+    usual_size, usual_fps = DEFAULTS[out.suffix.lower()]
+    size, fps = size or usual_size, fps or usual_fps
     if min(size) < 64 or max(size) > _WIDEST or size[0] % 2 or size[1] % 2 or not 1 <= fps <= _FASTEST:
         raise RenderError(
             f"even sizes of 64 to {_WIDEST} pixels and 1 to {_FASTEST} frames per second are allowed, "
@@ -245,12 +251,15 @@ def _encoder(job: Job) -> Any:
     import imageio_ffmpeg
 
     if job.out.lower().endswith(".gif"):
-        # a palette per frame keeps the encoder's memory at one frame
         codec = "gif"
-        options = [
-            "-vf",
-            "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=bayer",
-        ]
+        frames = (job.spec.horizon * job.spec.control_step / pace_of(job.spec) + _CARD) * job.fps
+        if 4 * job.width * job.height * frames <= _MOST_GIF_BYTES:
+            palette = "palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer:bayer_scale=5"
+            palette += ":diff_mode=rectangle"
+        else:
+            # a palette per frame keeps the encoder's memory at one frame
+            palette = "palettegen=stats_mode=single[p];[b][p]paletteuse=new=1:dither=bayer"
+        options = ["-vf", f"split[a][b];[a]{palette}"]
     else:
         codec = "libx264"
         options = ["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1"]
