@@ -387,3 +387,20 @@ def test_scores_are_told_and_written_before_films_and_survive_an_interruption(tm
     results = json.loads((tmp_path / "results.json").read_text())
     assert (results["films"], results["film_trouble"]) == ([], ["interrupted"])
     assert "interrupted" in (tmp_path / "report.html").read_text()
+
+
+def test_marks_of_a_histogram_tell_their_own_value():
+    """Not that of the axis' end, which stood below the word before."""
+    spec = task_spec("coop_nav-3")
+    rows = [{"return": value} for value in (-41.0, -20.0, -1.6)]
+    drawn = report._returns(spec, rows)
+    values = {mark.label: mark.value for mark in drawn.marks}
+    assert values == {
+        "random": f"{spec.anchors.random.mean:.1f}", "reference": f"{spec.anchors.reference.mean:.1f}",
+        "mean": "-20.9",
+    }  # fmt: skip
+    assert drawn.high == "-1.6"
+    # each stands where its value is on the axis
+    low, high = float(drawn.low), float(drawn.high)
+    for mark in drawn.marks:
+        assert mark.x / 360 == pytest.approx((float(mark.value) - low) / (high - low), abs=0.01)

@@ -70,3 +70,14 @@ def test_every_example_is_run_and_short():
     assert set(examples) == {run.example for run in RUNS} | WINDOWS | SUBMISSIONS
     for name, lines in examples.items():
         assert len(lines) < 60, name
+
+
+def test_the_viewer_without_a_display_says_so_in_a_line():
+    environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+    done = subprocess.run(
+        [sys.executable, "examples/dm_viewer.py"], cwd=Path(__file__).parents[1], env=environment,
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "there is no display" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -250,7 +250,7 @@ def test_a_card_opens_from_the_table(visit):
     page = visit()
     page.locator("#table").get_by_role("link", name="newcomer").first.click()
     assert page.locator("h1").inner_text() == "newcomer"
-    assert page.locator(".readme").inner_text().strip() == "# A newcomer"
+    assert page.locator(".readme h2").inner_text().strip() == "A newcomer"
     assert page.locator(".badge").first.inner_text() == "✓ verified"
     assert page.locator("dt", has_text="rows compared").locator("+ dd").inner_text().startswith("12,")
     with page.expect_download() as got:
@@ -270,7 +270,7 @@ def test_what_a_submitter_wrote_is_text(visit, site):
         assert page.locator("body").is_visible()
         assert page.evaluate("window.pwned") is None
         for link in page.locator("a").evaluate_all("links => links.map(link => [link.href, link.rel])"):
-            outside = ("https://example.org/%22onmouseover=", "https://github.com/instadeepai/marl-eval")
+            outside = ("https://example.org/", "https://github.com/instadeepai/marl-eval")
             assert link[0].startswith((site.as_uri(), *outside))
             assert link[0].startswith("file:") or "noopener" in link[1]
     page = visit("agents/hostile.html")
@@ -375,7 +375,7 @@ def test_a_folder_with_something_else_is_not_replaced(board, tmp_path):
         build(board, tmp_path)
     with pytest.raises(BoardError, match="has no entries"):
         build(Board(tmp_path / "empty"), tmp_path / "site")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "thesis.tex"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.tex"]
 
 
 def test_serving_is_for_this_machine_only(board):

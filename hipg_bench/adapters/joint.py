@@ -35,8 +35,8 @@ def check_drawing(task: str, overrides: Mapping[str, Any]) -> None:
         if name in overrides:
             width, height = SIZE
             raise SpecError(
-                f"{task}: {name!r} is refused: pictures are {width} x {height}, from a camera that follows the "
-                f"team; `hipg-bench video --width` makes films of any size"
+                f"{task}: {name!r} is refused: pictures are {width} x {height}, from a camera that follows "
+                f"the team; `hipg-bench video --width` makes films of any size"
             )
 
 

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console, RenderableType
+from rich.padding import Padding
 from rich.progress import BarColumn, Progress, Task, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -103,8 +104,13 @@ def table(*columns: str, title: str | None = None) -> Table:
 class _Table(Table):
     """A table whose cells are plain text: names and reasons come from strangers."""
 
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.texts: list[tuple[str, ...]] = []
+
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
         """Add a row; see rich's own."""
+        self.texts.append(tuple(str(cell or "") for cell in cells))
         plain = (Text(printable(cell)) if isinstance(cell, str) else cell for cell in cells)
         super().add_row(*plain, **options)
 
@@ -126,9 +132,39 @@ _UNPRINTABLE = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
 
 def show(rows: Table) -> None:
     """Print a table; wide enough for a pipe or file that has no width."""
-    if not sys.stdout.isatty():
+    if not out.file.isatty():
         out.width = max(out.width, 240)
-    out.print(rows)
+    if isinstance(rows, _Table) and not _fits(rows):
+        _print_records(rows)
+    else:
+        out.print(rows)
+
+
+_NARROWEST = 24
+"""Characters that the last column of a table needs to be read."""
+
+
+def _fits(rows: _Table) -> bool:
+    """Whether all columns but the last are narrow enough to leave room for it."""
+    headers = [str(column.header) for column in rows.columns]
+    widths = [max(len(line) for line in column) for column in zip(headers, *rows.texts, strict=False)]
+    *others, last = widths
+    return sum(others) + 2 * len(others) + min(last, _NARROWEST) <= out.width
+
+
+def _print_records(rows: _Table) -> None:
+    """Print rows one below the other, for a narrow terminal."""
+    if rows.title:
+        say(f"{rows.title}".lstrip("\n"))
+    headers = [str(column.header).strip() for column in rows.columns]
+    for first, *cells in rows.texts:
+        out.print(Text(printable(first), style="bold"))
+        told = [
+            f"{header}: {cell}" if header else cell
+            for header, cell in zip(headers[1:], cells, strict=False)
+            if cell.strip() not in ("", "-")
+        ]
+        out.print(Padding(Text(printable("; ".join(told))), (0, 0, 0, 2)))
 
 
 def say(text: str) -> None:

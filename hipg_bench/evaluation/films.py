@@ -161,6 +161,7 @@ def _make_one(one: Film, stop: threading.Event, advance: Callable[[float], None]
         one.spec, rows, one.video, agent=one.agent, end_reason=one.end_reason, size=_SIZE, fps=_FPS,
         progress=progress,
     )  # fmt: skip
+    film.write_poster(one.video, one.video.with_suffix(".jpg"))
 
 
 def _is_of(saved: Path, row: Row) -> bool:

@@ -11,6 +11,7 @@ import jinja2
 import numpy as np
 
 from hipg_bench.evaluation.episodes import Row
+from hipg_bench.evaluation.words import end_reason, metric
 from hipg_bench.spec import TaskSpec
 
 _BINS = 36
@@ -74,7 +75,15 @@ def render(
         for task in results["tasks"]
     ]
     page = environment.get_template("report.html.j2")
-    return page.render(results=results, tasks=tasks, place=_place, width=_WIDTH, height=_HEIGHT)
+    return page.render(
+        end_reason=end_reason,
+        metric=metric,
+        results=results,
+        tasks=tasks,
+        place=_place,
+        width=_WIDTH,
+        height=_HEIGHT,
+    )
 
 
 def _place(score: float) -> float:

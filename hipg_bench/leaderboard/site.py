@@ -27,10 +27,13 @@ import markupsafe
 from hipg_bench import registry
 from hipg_bench.errors import BoardError, HipgError
 from hipg_bench.evaluation import export, splits
+from hipg_bench.evaluation.words import end_reason
 from hipg_bench.leaderboard import pictures, standings
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry_view import EntryView, read_entry_view
+from hipg_bench.leaderboard.model_card import to_html
 from hipg_bench.leaderboard.salt import Commitments, read_commitments
+from hipg_bench.rendering import film
 from hipg_bench.spec import TaskSpec
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -156,6 +159,7 @@ def _pages(view: View, out: Path) -> None:
     environment = _environment()
     common: dict[str, Any] = {
         "view": view, "splits": splits.SPLITS, "split_names": SPLIT_NAMES, "status_says": STATUS_SAYS,
+        "end_reason": end_reason,
         **_inline("style.css"), **_inline("theme.js"), **_inline("page.js"),
     }  # fmt: skip
     seen = pictures.overview(view.panels, view.specs)
@@ -191,6 +195,7 @@ def _environment() -> jinja2.Environment:
     filters = cast(dict[str, Any], environment.filters)
     filters |= {
         "number": _number, "share": _share, "interval": _interval, "place": place, "breakable": _breakable,
+        "markdown": to_html,
     }  # fmt: skip
     return environment
 
@@ -234,6 +239,8 @@ def _data(view: View, out: Path) -> None:
                 target = out / one.name / path.relative_to(one.folder)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)
+                if path.suffix == ".mp4":
+                    film.write_poster(path, target.with_suffix(".jpg"))
     summary = [
         {
             "split": panel.split, "family": panel.family, "worlds": worlds, "rank": line.rank,

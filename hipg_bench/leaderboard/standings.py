@@ -45,7 +45,7 @@ class Line:
 
     @property
     def comparable(self) -> bool:
-        """Whether the score means something: a reference that is not made for all tasks is no entry that failed."""
+        """Whether the score means something: not that of a reference which is made for some tasks only."""
         return self.view.kind != "reference" or self.played == self.tasks
 
     @property

@@ -137,6 +137,26 @@ def record(
         _run_child(Path(folder), chosen, spec.task, progress)
 
 
+def write_poster(video: Path, out: Path, seconds: float = 2.5) -> bool:
+    """Write a film's picture some seconds after its beginning as a JPEG; False if there is none.
+
+    Pages show it until a film is played: browsers show a black picture otherwise.
+    """
+    import imageio_ffmpeg
+
+    exact = ("-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1", "-threads", "1")
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-ss", f"{seconds}", "-i", str(video),
+        "-frames:v", "1", "-q:v", "4", *exact, "-f", "image2pipe", "-c:v", "mjpeg", "-",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL)
+    if not done.stdout:
+        return False
+    with replacing(out) as temporary:
+        temporary.write_bytes(done.stdout)
+    return True
+
+
 def _run_child(folder: Path, backend: str, task: str, progress: Progress | None) -> None:
     """Render in a child process; end it if it hangs.
 

@@ -212,3 +212,18 @@ def test_unknown_names_are_met_with_the_nearest_here_too():
         gymnasium.make_vec(f"hipg/{TASK}-v1", 2, horizn=3)
     with refused(RenderError, "hazard_nav-4: the render mode 'rgb_array' is allowed, got 'human'"):
         HipgEnv(TASK, render_mode="human")
+
+
+def test_drawing_that_gymnasium_asks_for_and_we_do_not_have():
+    """What to do instead is said, and no field of the task is suggested."""
+    with refused(SpecError, f"{TASK}: 'width' is refused: pictures are 640 x 360", "hipg-bench video"):
+        gymnasium.make(f"hipg/{TASK}-v1", width=320)
+    with refused(SpecError, "'height' is refused"):
+        gymnasium.make_vec(f"hipg/{TASK}-v1", num_envs=2, height=200)
+    with refused(RenderError, "many worlds are not drawn", "vectorization_mode='sync'"):
+        gymnasium.make_vec(f"hipg/{TASK}-v1", num_envs=2, render_mode="rgb_array")
+    envs = gymnasium.make_vec(
+        f"hipg/{TASK}-v1", num_envs=2, vectorization_mode="sync", render_mode="rgb_array"
+    )
+    assert envs.num_envs == 2
+    envs.close()
