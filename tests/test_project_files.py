@@ -36,7 +36,10 @@ def test_workflows_are_well_formed(path):
 
 def test_the_workflows_run_what_must_pass():
     runs = [
-        step.get("run", "") for path in WORKFLOWS for job in read(path)["jobs"].values() for step in job["steps"]
+        step.get("run", "")
+        for path in WORKFLOWS
+        for job in read(path)["jobs"].values()
+        for step in job["steps"]
     ]
     assert ".ci/run" in runs
     assert any("python -m build" in run for run in runs)
