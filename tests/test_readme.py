@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 README = Path(__file__).parent.parent / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
@@ -70,3 +71,14 @@ def test_every_command_shown_exists() -> None:
     shown = set(re.findall(r"hipg-bench ([a-z]+)", README.read_text(encoding="utf-8")))
     assert {"evaluate", "train", "video", "bench", "calibrate", "doctor"} <= shown
     assert shown <= set(get_command(app).commands)
+
+
+def test_the_films_at_the_top_loop_and_are_small() -> None:
+    names = re.findall(r'<img src="([^"]+\.webp)"', README.read_text(encoding="utf-8"))
+    films = [README.parent / name for name in names]
+    assert len(set(films)) == 6
+    assert sum(film.stat().st_size for film in films) < 6_000_000
+    for film in films:
+        with Image.open(film) as image:
+            assert image.n_frames > 50
+            assert image.info["loop"] == 0, "0 means without end"
