@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hipg_bench.adapters.pettingzoo import parallel_env
     from hipg_bench.env import BatchEnv, Step
     from hipg_bench.layout import Block, Layout, TaskLayout
-    from hipg_bench.registry import make, read_task, tagged, task_spec, tasks
+    from hipg_bench.registry import make, read_task, register_family, tagged, task_spec, tasks
     from hipg_bench.spec import TaskSpec
 
 __version__ = "0.1.0"
@@ -33,6 +33,7 @@ __all__ = [
     "make",
     "parallel_env",
     "read_task",
+    "register_family",
     "tagged",
     "task_spec",
     "tasks",
@@ -43,7 +44,7 @@ _HOMES = {
     "adapters.pettingzoo": ("parallel_env",),
     "env": ("BatchEnv", "Step"),
     "layout": ("Block", "Layout", "TaskLayout"),
-    "registry": ("make", "read_task", "tagged", "task_spec", "tasks"),
+    "registry": ("make", "read_task", "register_family", "tagged", "task_spec", "tasks"),
     "spec": ("TaskSpec",),
 }
 

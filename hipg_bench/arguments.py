@@ -65,7 +65,7 @@ def numbers(
     of = "" if shape is None else f" of shape {shape}"
     allowed = f"{task}: numbers{of} are allowed{whose}{note}, got"
     try:
-        array = np.asarray(_plain(value))
+        array = value if type(value) is np.ndarray else np.asarray(_plain(value))
     except (ValueError, TypeError, RuntimeError) as error:
         raise ActionError(f"{allowed} {abbreviate(value)}: {error}") from error
     if array.dtype.kind not in "fiub" or (shape is not None and array.shape != shape):
@@ -79,6 +79,6 @@ def _plain(value: Any) -> Any:
         if value.is_complex():
             raise TypeError("a complex tensor")
         return value.detach().cpu().double().numpy()
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_plain(one) for one in value]
     return value

@@ -1,36 +1,53 @@
-"""B worlds of one task, stepped together. `BatchEnv.step` is the architecture in one function."""
+"""B worlds of one task, stepped together: what users call. What a step does is in `hipg_bench.engine`."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn, TypedDict
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from hipg_bench import episode
 from hipg_bench.arguments import MOST_EPISODE, MOST_SEED, numbers, whole
-from hipg_bench.episode import NEVER, memory_fields
-from hipg_bench.errors import ActionError, HipgError, SpecError
-from hipg_bench.families.family import Family, Harm
+from hipg_bench.errors import ActionError, HipgError, SpecError, UnknownNameError, hint
+from hipg_bench.families.family import METRICS, NEVER, Definition
 from hipg_bench.families.scene import without_visuals
 from hipg_bench.layout import TaskLayout
-from hipg_bench.mechanics import health as health_law
-from hipg_bench.sim import Sim
-from hipg_bench.spec import TaskSpec
+from hipg_bench.records import places
+from hipg_bench.stepper import Stepper
 
 
-def world_model(spec: TaskSpec, family: Family, *, visual: bool = False) -> mujoco.MjModel:
+def world_model(definition: Definition, *, visual: bool = False) -> mujoco.MjModel:
     """Compile a task's world; the state rows are the same with and without what only a camera sees."""
-    scene = family.scene() if visual else without_visuals(family.scene())
-    scene.nuserdata = sum(memory_fields(spec, family).values())
+    scene = definition.scene() if visual else without_visuals(definition.scene())
+    scene.nuserdata = sum(int(np.prod(axes, dtype=int)) for axes in definition.memory.values())
     try:
         return scene.compile()
     except ValueError as error:
         said = " ".join(str(error).split())
-        raise SpecError(f"{spec.task}: MuJoCo refuses a world with these numbers: {said}") from error
+        raise SpecError(
+            f"{definition.spec.task}: MuJoCo refuses a world with these numbers: {said}"
+        ) from error
+
+
+class Info(TypedDict):
+    """What a step tells beside observation and reward; see `Step`."""
+
+    state: Float32[np.ndarray, "B S"]
+    health: Float[np.ndarray, "B N"]
+    alive: Bool[np.ndarray, "B N"]
+    terms: dict[str, Float[np.ndarray, "B"]]
+    metrics: dict[str, Float[np.ndarray, "B"]]
+    end_reason: np.ndarray
+    episode_id: Int[np.ndarray, "B"]
+    elapsed: Int[np.ndarray, "B"]
+    final_alive: Bool[np.ndarray, "B N"]
+    final_observation: Float32[np.ndarray, "n N O"]
+    final_state: Float32[np.ndarray, "n S"]
+    final_rows: Float[np.ndarray, "n R"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,71 +72,85 @@ class Step:
     reward: Float[np.ndarray, "B"]
     terminated: Bool[np.ndarray, "B"]
     truncated: Bool[np.ndarray, "B"]
-    info: dict[str, Any]
+    info: Info
 
 
 class BatchEnv:
     """B worlds of one task.
 
     What happens in an episode depends on (seed, episode id) and the actions, never on B, on the
-    thread count or on which world runs it. World b starts with episode b; a world that ends goes on
-    with the next id not yet used, in the same step, or waits for `reset` where ``autoreset`` is off.
+    thread count or on which world runs it. World b starts with episode b; a world that ends starts
+    the next id not yet used, in the same step, or waits for `reset` where ``autoreset`` is off.
 
     Attributes:
         spec: the task's numbers.
+        definition: what the task's family says of them.
         layout: what each number of an observation, action and joint state is.
         model: the compiled MjModel.
         decimation: physics steps per control step.
         metrics: names in ``Step.info["metrics"]``.
+        fields: name to axes of what a world holds; see `get_field`.
         num_envs, num_agents, action_size, observation_size, state_size: B, N, A, O, S.
     """
 
     def __init__(
         self,
-        spec: TaskSpec,
-        family: Family,
+        definition: Definition,
         num_envs: int,
         seed: int,
         *,
         threads: int = 0,
         autoreset: bool = True,
+        compiled: bool = True,
     ) -> None:
-        self.spec = spec
-        self.family = family
-        self.layout: TaskLayout = family.layout
+        self.definition = definition
+        self.spec = spec = definition.spec
+        self.layout: TaskLayout = definition.layout
         self.num_envs = num_envs
         self.num_agents = spec.num_agents
-        self.action_size = family.layout.action.size
-        self.observation_size = family.layout.observation.size
-        self.state_size = family.layout.state.size
-        self.metrics = (*episode.METRICS, *family.metrics)
-        self.decimation = family.physics_steps
-        self.model = world_model(spec, family)
-        self._threads = threads
-        self._sim = self._new_sim()
+        self.action_size = self.layout.action.size
+        self.observation_size = self.layout.observation.size
+        self.state_size = self.layout.state.size
+        self.metrics = (*METRICS, *definition.metrics)
+        self.decimation = definition.physics_steps
+        self.model = world_model(definition)
+        self._options: dict[str, Any] = {"threads": threads, "autoreset": autoreset, "compiled": compiled}
+        self._stepper = self._new_stepper()
+        self.fields: Mapping[str, tuple[int, ...]] = {
+            name: shape for name, (shape, *_) in places(self._stepper.worlds.dtype).items()
+        }
+        self._terms = (*definition.terms, "physics")
+        self._reasons = np.array(definition.reasons)
+        # last observations, states and rows of no world
+        self._nobody = (
+            np.empty((0, self.num_agents, self.observation_size), np.float32),
+            np.empty((0, self.state_size), np.float32),
+            np.empty((0, self._stepper.sim.rows.shape[1])),
+        )
         self._seed = seed
         self._autoreset = autoreset
         self._next_episode = 0
-        self._now: Any = None
+        self._begun = False
         self._waiting = np.ones(num_envs, bool)
+        self._any_waiting = True
         self._closed = False
 
     def __getstate__(self) -> dict[str, Any]:
         """What pickle and deepcopy keep: how it was built, and the worlds as they are."""
         return {
-            "built": (self.spec, self.family, self.num_envs, self._seed),
-            "options": {"threads": self._threads, "autoreset": self._autoreset},
+            "built": (self.definition, self.num_envs, self._seed), "options": self._options,
             "rows": self.rows, "waiting": self._waiting, "next_episode": self._next_episode,
-            "begun": self._now is not None, "closed": self._closed,
+            "begun": self._begun, "closed": self._closed,
         }  # fmt: skip
 
     def __setstate__(self, kept: Mapping[str, Any]) -> None:
-        """Go on where the original was."""
+        """Resume where the original was."""
         self.__init__(*kept["built"], **kept["options"])
-        self._next_episode, self._closed = kept["next_episode"], kept["closed"]
         if kept["begun"]:
-            self._take_over(kept["rows"])
-            self._waiting = np.array(kept["waiting"])
+            self._stepper.sim.rows[:] = kept["rows"]
+            self._look_at_all()
+            self._wait(np.array(kept["waiting"]))
+        self._next_episode, self._closed = kept["next_episode"], kept["closed"]
 
     def reset(
         self,
@@ -128,7 +159,7 @@ class BatchEnv:
         worlds: Int[np.ndarray, "n"] | None = None,
         seed: int | None = None,
     ) -> Step:
-        """Start worlds anew.
+        """Start new episodes.
 
         Args:
             episode_id: (n,) the episodes to run, by default the next not yet used.
@@ -155,9 +186,13 @@ class BatchEnv:
             )
         if seed is not None:
             self._seed, self._next_episode = seed, 0
-        if len(ids):
-            self._begin(ids, episodes)
-        return self._resume(ids)
+        self._stepper.fresh()
+        self._begin(ids, episodes)
+        others = np.setdiff1d(np.arange(self.num_envs), ids)
+        self._stepper.observe(others)
+        waiting = self._waiting.copy()
+        waiting[ids] = False
+        return self._standing(waiting)
 
     def step(self, action: Float[np.ndarray, "B N A"]) -> Step:
         """Advance every world by one control step; worlds whose episode ends start their next one.
@@ -169,57 +204,27 @@ class BatchEnv:
         Raises:
             ActionError: wrong shape, or a value that is not finite, naming the env and the agent.
         """
+        stepper = self._stepper if not self._closed and not self._stepper.sim.lost else self._check_open()
         action = self._checked(action)
-        sim, family, field, was = self._sim, self.family, self._sim.field, self._now
-
-        # the world moves; the dead exert no force
-        if self.spec.graded_health:
-            action = action * field["health"][:, :, None]
-        family.act(sim, was, action)
-        diverged = sim.advance()
-        now = family.read(sim)
-
-        # harm becomes death
-        field["elapsed"] += 1
-        self._wound(now, family.harm(was, now))
-        now = family.remember(sim, was, now)
-
-        # the team is paid, and told how it ended
-        terms = self._weighted(family.reward(was, now))
-        ruled, reason = family.terminated(now)
-        terminated = ruled | diverged
-        truncated = ~terminated & (field["elapsed"][:, 0] >= self.spec.horizon)
-        terms = self._pay_floor(terms, diverged)
-        # one after another: NumPy may pair the summands by the number of worlds, which changes last bits
-        reward = sum(terms.values(), np.zeros(self.num_envs))
-        field["return"][:, 0] += reward
-        done = terminated | truncated
-        (ended,) = done.nonzero()
-        end_reason = np.full(self.num_envs, "")
-        if len(ended):
-            by_rule = np.where(ruled, reason, np.where(truncated, "horizon", ""))
-            end_reason = np.where(diverged, "physics", by_rule)
-
-        # what was seen, then the next episode where this one is over
-        observation, state = self._perceive(now)
-        info: dict[str, Any] = {
-            "final_observation": observation[ended], "final_state": state[ended],
-            "final_rows": sim.rows[ended], "final_alive": now.health > 0,
-            "terms": terms, "end_reason": end_reason, "metrics": self._measure(now, ended),
-        }  # fmt: skip
-        if len(ended) and self._autoreset:
+        over = stepper.advance(action)
+        if over < 0:
+            self._refuse_infinite(action)
+        if not over:
+            return self._told(self._nobody, None)
+        results = stepper.results
+        reason = results["reason"]
+        (ended,) = reason.nonzero()
+        last = results.observation[ended], results.state[ended], stepper.sim.rows[ended]
+        if self._autoreset:
             self._begin(ended, self._next_episode + np.arange(len(ended)))
-            fresh = family.read(sim, ended)
-            observation[ended], state[ended] = self._perceive(fresh)
-            self._now = fresh if len(ended) == self.num_envs else family.renew(sim, now, ended, fresh)
         else:
-            self._now, self._waiting = now, done
-        return Step(observation, reward, terminated, truncated, info | self._present(state))
+            self._wait(reason > 0)
+        return self._told(last, self._reasons[reason])
 
     @property
     def rows(self) -> Float[np.ndarray, "B R"]:
         """A copy of all worlds: row b is everything that evolves in world b."""
-        return self._sim.rows.copy()
+        return self._stepper.sim.rows.copy()
 
     def load_rows(self, ids: Int[np.ndarray, "n"], rows: Float[np.ndarray, "n R"]) -> Step:
         """Put saved worlds into places ``ids``; return what agents see now, reward 0.
@@ -229,13 +234,17 @@ class BatchEnv:
         """
         self._check_open()
         ids = self._checked_worlds(ids)
-        expected = (len(ids), self._sim.rows.shape[1])
-        if rows.shape != expected:
-            raise HipgError(f"{self.spec.task}: rows of shape {expected} are allowed, got {rows.shape}")
-        self._sim.reset(ids)
-        self._sim.rows[ids] = rows
-        self._next_episode = max(self._next_episode, int(self._sim.field["episode_id"].max()) + 1)
-        return self._resume(ids)
+        rows = self._checked_rows(rows)
+        if len(rows) != len(ids):
+            self._refuse_rows(rows, len(ids))
+        sim = self._stepper.sim
+        sim.rows[ids] = rows
+        sim.forget_warnings(ids)
+        self._next_episode = max(self._next_episode, int(self._stepper.worlds["episode_id"].max()) + 1)
+        waiting = self._waiting.copy()
+        waiting[ids] = False
+        self._look_at_all()
+        return self._standing(waiting)
 
     def fork(self, rows: Float[np.ndarray, "n R"], health: Mapping[int, float]) -> Float[np.ndarray, "n R"]:
         """Return copies of saved worlds in which some agents' health is set: the true counterfactual.
@@ -247,130 +256,159 @@ class BatchEnv:
             health: agent to its new health, in [0, 1].
 
         Raises:
-            HipgError: an agent outside 0..N-1, or a health outside [0, 1].
+            HipgError: rows of another task, an agent outside 0..N-1, or a health outside [0, 1].
         """
-        forked = rows.copy()
-        current = self._sim.userdata_of(forked, "health")
-        died_at = self._sim.userdata_of(forked, "death_time")
-        elapsed = self._sim.userdata_of(forked, "elapsed")[:, 0]
+        forked = self._checked_rows(rows).copy()
+        worlds = self._records(forked)
         for agent, value in health.items():
             if not (0 <= agent < self.num_agents and 0 <= value <= 1):
                 raise HipgError(
                     f"{self.spec.task}: agents 0..{self.num_agents - 1} and health in [0, 1] are allowed, "
                     f"got health[{agent}] = {value}"
                 )
+            current = worlds["health"][:, agent]
             if value == 0:
-                died_at[:, agent] = np.where(current[:, agent] > 0, elapsed, died_at[:, agent])
-            current[:, agent] = np.minimum(current[:, agent], value)
+                died = current > 0
+                worlds["death_time"][died, agent] = worlds["elapsed"][died]
+            worlds["health"][:, agent] = np.minimum(current, value)
         return forked
 
-    def recall(self, rows: Float[np.ndarray, "n R"], name: str) -> Float[np.ndarray, "n size"]:
-        """What saved worlds remember, by name, e.g. ``death_time`` (control steps, `NEVER` while alive)."""
-        return self._sim.userdata_of(rows, name)
+    def get_field(self, name: str, rows: Float[np.ndarray, "n R"] | None = None) -> np.ndarray:
+        """A copy of what worlds hold under a name, e.g. ``death_time`` (control steps, `NEVER` while alive).
+
+        Args:
+            name: one of `fields`.
+            rows: saved worlds; by default those of this environment as they stand.
+
+        Returns:
+            (n, *axes) float64, the axes as in `fields`.
+
+        Raises:
+            UnknownNameError: no such field.
+            HipgError: rows of another task.
+        """
+        self._check_field(name)
+        worlds = self._stepper.worlds if rows is None else self._records(self._checked_rows(rows))
+        return worlds[name].copy()
+
+    def set_field(self, rows: Float[np.ndarray, "n R"], name: str, value: Any) -> Float[np.ndarray, "n R"]:
+        """Return copies of saved worlds in which a field is set; `load_rows` puts them into an environment.
+
+        Args:
+            rows: saved worlds.
+            name: one of `fields`.
+            value: of shape (n, *axes), or broadcastable to it.
+
+        Raises:
+            UnknownNameError: no such field.
+            HipgError: rows of another task, or a value of the wrong shape.
+        """
+        self._check_field(name)
+        changed = self._checked_rows(rows).copy()
+        array = numbers(value, self.spec.task, whose=f" as {name}")
+        expected = (len(changed), *self.fields[name])
+        try:
+            self._records(changed)[name][...] = array
+        except ValueError as error:
+            raise HipgError(
+                f"{self.spec.task}: {name} of shape {expected} is allowed, got {array.shape}"
+            ) from error
+        return changed
+
+    def arrange(self, worlds: Int[np.ndarray, "n"] | None = None, **fields: Any) -> Step:
+        """Set fields of running worlds, e.g. positions, health or hazards, for a test or a study.
+
+        Args:
+            worlds: (n,) which, by default all of them.
+            **fields: field name to values of shape (n, *axes), or broadcastable to it.
+
+        Returns:
+            What the agents see now, reward 0.
+
+        Raises:
+            UnknownNameError: no such field.
+            HipgError: worlds outside 0..B-1 or named twice, or values of the wrong shape.
+        """
+        self._check_open()
+        ids = self._checked_worlds(np.arange(self.num_envs) if worlds is None else worlds)
+        rows = self._stepper.sim.rows[ids]
+        for name, value in fields.items():
+            rows = self.set_field(rows, name, value)
+        return self.load_rows(ids, rows)
 
     def close(self) -> None:
         """Refuse further use."""
         self._closed = True
 
     def _begin(self, ids: Int[np.ndarray, "n"], episodes: Int[np.ndarray, "n"]) -> None:
-        """Start episodes in worlds ``ids``: all chance of an episode is drawn here."""
-        n = self.num_agents
-        chance = episode.draw(self._seed, episodes, n + self.family.chance_size)
-        self._sim.reset(ids)
-        field = self._sim.field
-        field["health"][ids] = 1.0
-        field["toughness"][ids] = -np.log1p(-chance[:, :n])
-        field["death_time"][ids] = NEVER
-        field["episode_id"][ids, 0] = episodes
-        self._next_episode = max(self._next_episode, int(episodes.max(initial=-1)) + 1)
-        self.family.reset(self._sim, ids, chance[:, n:])
-
-    def _resume(self, ids: Int[np.ndarray, "n"]) -> Step:
-        """Look at the worlds as they stand; ``ids`` are ready to go on."""
-        self._waiting[ids] = False
-        self._sim.disable(self._sim.field["health"] == 0)
-        self._now = self.family.read(self._sim)
-        observation, state = self._perceive(self._now)
-        nothing = np.zeros(self.num_envs, bool)
-        info: dict[str, Any] = {
-            "final_observation": observation[:0].copy(), "final_state": state[:0].copy(),
-            "final_rows": self._sim.rows[:0].copy(), "final_alive": self._sim.field["health"] > 0,
-            "terms": {name: np.zeros(self.num_envs) for name in (*self.spec.weights, "physics")},
-            "end_reason": np.full(self.num_envs, ""),
-            "metrics": self._measure(self._now, np.empty(0, np.int64)),
-        }  # fmt: skip
-        info |= self._present(state)
-        return Step(observation, np.zeros(self.num_envs), nothing, nothing.copy(), info)
-
-    def _present(self, state: Float[np.ndarray, "B S"]) -> dict[str, Any]:
-        """The part of ``info`` that belongs to the episode the observation is of."""
-        field = self._sim.field
-        return {
-            "state": state,
-            "health": field["health"].copy(),
-            "alive": field["health"] > 0,
-            "episode_id": field["episode_id"][:, 0].astype(np.int64),
-            "elapsed": field["elapsed"][:, 0].astype(np.int64),
-        }
-
-    def _perceive(self, now: Any) -> tuple[Float[np.ndarray, "n N O"], Float[np.ndarray, "n S"]]:
-        """Observations, the dead blinded (property 4 of the paper), and joint states."""
-        observation, layout = self.family.observe(now), self.layout
-        dead = now.health == 0
-        if self.spec.dead_observation == "blank" and dead.any():
-            observation[dead] = 0.0
-            observation[dead, layout.observation.slices[layout.health_block]] = layout.dead_value
-        return observation, self.family.state(now)
-
-    def _measure(self, now: Any, ids: Int[np.ndarray, "n"]) -> dict[str, Float[np.ndarray, "B"]]:
-        """Metrics of the episodes that end in worlds ``ids``; NaN elsewhere."""
-        out = dict(zip(self.metrics, np.full((len(self.metrics), self.num_envs), np.nan), strict=True))
+        """Start episodes in worlds ``ids``: all random numbers of an episode are drawn here."""
         if len(ids):
-            told = episode.measure(self._sim.field, ids) | self.family.measure(self._sim, ids, now)
-            for name, value in told.items():
-                out[name][ids] = value
-        return out
+            random = episode.draw(self._seed, episodes, self.definition.num_random)
+            self._stepper.begin(ids, episodes, random)
+            self._next_episode = max(self._next_episode, int(episodes.max()) + 1)
+        self._begun = True
 
-    def _wound(self, now: Any, harm: Harm) -> None:
-        """Turn harm into death, in the snapshot too; actuators of the dead are cut."""
-        sim, field, hurt = self._sim, self._sim.field, harm.cases
-        if not len(hurt[0]):
-            return
-        had = field["health"][hurt]
-        health, field["exposure"][hurt] = health_law.damage(
-            had, field["exposure"][hurt], field["toughness"][hurt], harm.exposure[hurt], harm.fatal[hurt],
-            graded=self.spec.graded_health,
-        )  # fmt: skip
-        field["health"][hurt] = now.health[hurt] = health
-        died = tuple(axis[(health == 0) & (had > 0)] for axis in hurt)
-        if len(died[0]):
-            field["death_time"][died] = field["elapsed"][died[0], 0]
-            field["death_cause"][died] = harm.cause[died]
-            sim.disable(now.health == 0)
+    def _look_at_all(self) -> None:
+        """Observe all worlds as they stand."""
+        self._stepper.fresh()
+        self._stepper.observe(np.arange(self.num_envs))
+        self._begun = True
 
-    def _weighted(self, terms: Mapping[str, Float[np.ndarray, "B"]]) -> dict[str, Float[np.ndarray, "B"]]:
-        """The family's terms times the task's weights."""
-        weights = self.spec.weights
-        if not terms.keys() <= weights.keys():
-            missing = ", ".join(sorted(terms.keys() - weights.keys()))
-            raise SpecError(f"{self.spec.task}: weights need {missing}, the family's reward terms")
-        return {name: weights[name] * term for name, term in terms.items()}
+    def _standing(self, waiting: Bool[np.ndarray, "B"]) -> Step:
+        """What agents see of worlds that were not stepped, of which some are ``waiting`` for a reset."""
+        self._wait(waiting)
+        results = self._stepper.results
+        for name in ("reward", "terms", "reason", "terminated", "truncated"):
+            results[name][...] = 0
+        results["metrics"][...] = np.nan
+        results["final_alive"][...] = results["alive"]
+        return self._told(self._nobody, None)
 
-    def _pay_floor(
-        self, terms: dict[str, Float[np.ndarray, "B"]], diverged: Bool[np.ndarray, "B"]
-    ) -> dict[str, Float[np.ndarray, "B"]]:
-        """Make the return of diverged episodes the task's floor, so that breaking physics never pays."""
-        if not diverged.any():
-            return {**terms, "physics": np.zeros(self.num_envs)}
-        floor = self.spec.floor - self._sim.field["return"][:, 0]
-        paid = {name: np.where(diverged, 0.0, term) for name, term in terms.items()}
-        return {**paid, "physics": np.where(diverged, floor, 0.0)}
+    def _told(self, last: tuple[np.ndarray, np.ndarray, np.ndarray], end_reason: np.ndarray | None) -> Step:
+        """The last call's results as users know them."""
+        results = self._stepper.results
+        terms, metrics = results["terms"], results["metrics"]
+        info: Info = {
+            "state": results.state,
+            "health": results["health"],
+            "alive": results["alive"].view(bool),
+            "terms": {name: terms[:, k] for k, name in enumerate(self._terms)},
+            "metrics": {name: metrics[:, k] for k, name in enumerate(self.metrics)},
+            "end_reason": np.zeros(self.num_envs, "U1") if end_reason is None else end_reason,
+            "episode_id": results["episode_id"],
+            "elapsed": results["elapsed"],
+            "final_alive": results["final_alive"].view(bool),
+            "final_observation": last[0],
+            "final_state": last[1],
+            "final_rows": last[2],
+        }
+        terminated, truncated = results["terminated"].view(bool), results["truncated"].view(bool)
+        return Step(results.observation, results["reward"], terminated, truncated, info)
+
+    def _wait(self, waiting: Bool[np.ndarray, "B"]) -> None:
+        self._waiting, self._any_waiting = waiting, bool(waiting.any())
+
+    def _records(self, rows: Float[np.ndarray, "n R"]) -> np.ndarray:
+        return rows.view(self._stepper.worlds.dtype)[:, 0]
+
+    def _checked_rows(self, rows: Any) -> Float[np.ndarray, "n R"]:
+        array = numbers(rows, self.spec.task, whose=" as rows")
+        if array.ndim != 2 or array.shape[1] != self._stepper.sim.rows.shape[1]:
+            self._refuse_rows(array, "n")
+        return np.ascontiguousarray(array, np.float64)
+
+    def _refuse_rows(self, rows: np.ndarray, count: int | str) -> NoReturn:
+        expected = (count, self._stepper.sim.rows.shape[1])
+        raise HipgError(f"{self.spec.task}: rows of shape {expected} are allowed, got {rows.shape}")
+
+    def _check_field(self, name: str) -> None:
+        if name not in self.fields:
+            raise UnknownNameError(f"{self.spec.task}: no field {name!r}{hint(name, self.fields)}")
 
     def _checked(self, action: Float[np.ndarray, "B N A"]) -> Float[np.ndarray, "B N A"]:
-        self._check_open()
-        if self._now is None:
+        if not self._begun:
             raise HipgError(f"{self.spec.task}: step() before reset()")
-        if self._waiting.any():
+        if self._any_waiting:
             raise HipgError(
                 f"{self.spec.task}: env {int(self._waiting.argmax())} is waiting for reset(), "
                 f"its episode is over or has not begun"
@@ -381,28 +419,16 @@ class BatchEnv:
             raise ActionError(
                 f"{self.spec.task}: actions of shape {expected} (B, N, A) are allowed, got {action.shape}"
             )
-        alive = self._sim.field["health"] > 0
-        # a sum is finite only if all its terms are
-        with np.errstate(over="ignore", invalid="ignore"):
-            finite = np.isfinite(action.sum())
-        if not finite:
-            self._refuse_infinite(action, alive)
-        if self.spec.clip_actions:
-            action = action.clip(-1.0, 1.0)
-        if not alive.all():
-            action = action.copy()
-            action[~alive] = 0.0
-        return action
+        return np.ascontiguousarray(action)
 
-    def _refuse_infinite(self, action: Float[np.ndarray, "B N A"], alive: Bool[np.ndarray, "B N"]) -> None:
-        """Raise if somebody alive is told a number that is not finite."""
-        bad = alive[:, :, None] & ~np.isfinite(action)
-        if bad.any():
-            env, agent, axis = np.argwhere(bad)[0].tolist()
-            raise ActionError(
-                f"{self.spec.task}: finite actions are allowed, got {action[env, agent, axis]} "
-                f"for env {env}, agent {agent} ({self.layout.action.blocks[0].name}[{axis}])"
-            )
+    def _refuse_infinite(self, action: Float[np.ndarray, "B N A"]) -> NoReturn:
+        """Name a live agent's action that is not finite."""
+        bad = (self._stepper.worlds["health"] > 0)[:, :, None] & ~np.isfinite(action)
+        env, agent, axis = np.argwhere(bad)[0].tolist()
+        raise ActionError(
+            f"{self.spec.task}: finite actions are allowed, got {action[env, agent, axis]} "
+            f"for env {env}, agent {agent} ({self.layout.action.blocks[0].name}[{axis}])"
+        )
 
     def _checked_worlds(self, worlds: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
         worlds = np.atleast_1d(self._checked_integers(worlds, "worlds"))
@@ -430,25 +456,26 @@ class BatchEnv:
             raise HipgError(f"{self.spec.task}: {what} up to 2^53 - 1 are allowed, got {array.tolist()}")
         return array.astype(np.int64)
 
-    def _check_open(self) -> None:
+    def _check_open(self) -> Stepper:
         if self._closed:
             raise HipgError(f"{self.spec.task}: this environment is closed")
-        if self._sim.lost:
-            rows = self._sim.rows.copy()
-            self._sim = self._new_sim()
-            if self._now is not None:
-                self._take_over(rows)
+        if self._stepper.sim.lost:
+            rows = self._stepper.sim.rows.copy()
+            self._stepper = self._new_stepper()
+            if self._begun:
+                self._stepper.sim.rows[:] = rows
+                self._look_at_all()
+        return self._stepper
 
-    def _new_sim(self) -> Sim:
-        fields = memory_fields(self.spec, self.family)
-        return Sim(self.model, self.num_envs, fields, decimation=self.decimation, threads=self._threads)
+    def _new_stepper(self) -> Stepper:
+        options = self._options
+        return Stepper(
+            self.definition,
+            self.model,
+            self.num_envs,
+            threads=options["threads"],
+            compiled=options["compiled"],
+        )
 
-    def _take_over(self, rows: Float[np.ndarray, "B R"]) -> None:
-        """Go on from rows that were saved a moment ago; who waits for reset goes on waiting."""
-        self._sim.rows[:] = rows
-        self._sim.disable(self._sim.field["health"] == 0)
-        self._now = self.family.read(self._sim)
-        self._perceive(self._now)
 
-
-__all__ = ["NEVER", "BatchEnv", "Step", "world_model"]
+__all__ = ["NEVER", "BatchEnv", "Info", "Step", "world_model"]

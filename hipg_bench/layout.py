@@ -43,12 +43,21 @@ class Block:
         """Numbers this block takes."""
         return math.prod(self.shape)
 
+    def without(self) -> Block:
+        """The same block with nothing in it."""
+        return dataclasses.replace(self, shape=(0, *self.shape[1:]))
+
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """The blocks of one flat vector, in order."""
 
     blocks: tuple[Block, ...]
+
+    @functools.cached_property
+    def present(self) -> tuple[Block, ...]:
+        """The blocks that hold something: a block of size 0 stands for what a variant does not have."""
+        return tuple(block for block in self.blocks if block.size)
 
     @functools.cached_property
     def size(self) -> int:
@@ -108,6 +117,7 @@ class TaskLayout:
         state: the joint state, S numbers.
         health_block: the state block with one entry per agent that says whether it lives.
         dead_value: what that entry holds at health 0 (1 where the block flags the terminated).
+        previous: how many numbers at the end of an observation are those of the step before.
     """
 
     observation: Layout
@@ -115,6 +125,7 @@ class TaskLayout:
     state: Layout
     health_block: str = "health"
     dead_value: float = 0.0
+    previous: int = 0
 
     @functools.cached_property
     def health_columns(self) -> np.ndarray:

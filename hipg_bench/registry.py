@@ -1,10 +1,10 @@
-"""Tasks by name: ``tasks/*.toml`` holds the numbers, `FAMILIES` the rules."""
+"""Tasks by name: ``tasks/*.toml`` holds the numbers, `hipg_bench.families` the rules."""
 
 from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +12,9 @@ from hipg_bench import spec as specs
 from hipg_bench.arguments import seed_or_entropy, whole
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import SpecError, UnknownNameError, hint
-from hipg_bench.families.family import Family
-from hipg_bench.families.hazard_comm import HazardComm
-from hipg_bench.families.hazard_nav import HazardNav
-from hipg_bench.families.multiwalker import MultiWalker
-from hipg_bench.families.paper_comm import PaperComm
-from hipg_bench.families.paper_nav import PaperNav
+from hipg_bench.families.known import definition_of, register_family
 from hipg_bench.paths import data_folder
 from hipg_bench.spec import TaskSpec
-
-FAMILIES: dict[str, Callable[[TaskSpec], Family]] = {
-    "hazard_nav": HazardNav,
-    "hazard_comm": HazardComm,
-    "multiwalker": MultiWalker,
-    "paper_nav": PaperNav,
-    "paper_comm": PaperComm,
-}
-"""Name in a task file to the class with its rules; one of your own is added here."""
-
 
 _MOST_THREADS = 1024
 
@@ -63,7 +48,7 @@ def add_task(spec: TaskSpec) -> TaskSpec:
     Raises:
         SpecError: another task has this name, or a number of the family is not allowed.
     """
-    family_of(spec)
+    definition_of(spec)
     known = tasks().get(spec.task) or _added.get(spec.task)
     if known is not None and known.fingerprint != spec.fingerprint:
         raise SpecError(f"{spec.task}: there is another task of this name: choose a different one")
@@ -119,17 +104,6 @@ def tagged(tag: str) -> tuple[str, ...]:
     return tuple(name for name, spec in tasks().items() if tag in spec.tags)
 
 
-def family_of(spec: TaskSpec) -> Family:
-    """Build the rules for a spec.
-
-    Raises:
-        SpecError: unknown family, or a number of the family that is not allowed.
-    """
-    if spec.family not in FAMILIES:
-        raise SpecError(f"{spec.task}: no family {spec.family!r}{hint(spec.family, FAMILIES)}")
-    return FAMILIES[spec.family](spec)
-
-
 def make(
     task: str | TaskSpec,
     num_envs: int = 1,
@@ -137,6 +111,7 @@ def make(
     *,
     threads: int = 0,
     autoreset: bool = True,
+    compiled: bool = True,
     **overrides: Any,
 ) -> BatchEnv:
     """Build B worlds of a task.
@@ -147,6 +122,7 @@ def make(
         seed: in 0..2^64 - 1; with the episode id it fixes all chance. None draws one.
         threads: physics threads; 0 for all cores that this process may use. Results do not depend on it.
         autoreset: a world whose episode ends starts the next in the same step; else it waits for ``reset``.
+        compiled: off to run the rules as Python, a thousand times slower, with bounds checked.
         **overrides: spec fields (``num_agents``, ``horizon``, ...), family numbers, or ``weights``.
 
     Raises:
@@ -159,4 +135,11 @@ def make(
     num_envs = whole(num_envs, f"{spec.task}: num_envs", 1)
     threads = whole(threads, f"{spec.task}: threads", 0, _MOST_THREADS)
     seed = seed_or_entropy(seed, f"{spec.task}: seed")
-    return BatchEnv(spec, family_of(spec), num_envs, seed, threads=threads, autoreset=autoreset)
+    return BatchEnv(
+        definition_of(spec), num_envs, seed, threads=threads, autoreset=autoreset, compiled=compiled
+    )
+
+
+__all__ = [
+    "add_task", "definition_of", "make", "read_task", "register_family", "tagged", "task_spec", "tasks",
+]  # fmt: skip

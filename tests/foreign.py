@@ -14,7 +14,11 @@ from hipg_bench.sandbox.budget import Budget
 WORKING = [name for name, result in choice.probe_all().items() if result.works]
 """Sandboxes that work on this machine, the best first."""
 TASK = registry.tasks()["hazard_nav-4"]
-N, SEEN, A = 4, registry.family_of(TASK).layout.observation.size, registry.family_of(TASK).layout.action.size
+N, SEEN, A = (
+    4,
+    registry.definition_of(TASK).layout.observation.size,
+    registry.definition_of(TASK).layout.action.size,
+)
 
 
 def policy(folder, source=None, *, spec=TASK, trust=False, budget=None, train_seed=0):
@@ -42,7 +46,7 @@ def step(agent, worlds=2, seed=5, steps=1, alive=None, spec=TASK):
     ids = np.arange(worlds)
     session = agent.initial_state(seed, ids, spec.num_agents)
     chance = np.random.default_rng(1)
-    size = registry.family_of(spec).layout.observation.size
+    size = registry.definition_of(spec).layout.observation.size
     observation = chance.normal(size=(worlds, spec.num_agents, size)).astype(np.float32)
     if alive is None:
         alive = np.ones((worlds, spec.num_agents), bool)

@@ -76,19 +76,18 @@ def test_the_dead_are_dead_in_the_true_counterfactual() -> None:
     np.testing.assert_allclose(mean, nobody * sum(0.9**k for k in range(44)), rtol=1e-6)
 
 
-def test_luck_is_drawn_anew_for_every_repeat() -> None:
+def test_thresholds_are_drawn_again_for_every_repeat() -> None:
     """A drone that stays in a deadly place dies in some repeats and lives in others."""
     settings = recommended("hazard_nav-4", bootstrap_truncation=False)
     env = make("hazard_nav-4", 1, seed=1, hazard_radius=3.0, hazard_peak=0.02)
     env.reset()
     rows = np.repeat(env.rows, 400, axis=0)
-    toughness = env.recall(rows, "toughness")
-    before = toughness.copy()
-    audit.redraw_randomness(env, rows, np.random.default_rng(0))
-    assert np.unique(toughness[:, 0]).size == 400
-    # exponential again: mean 1 above what was already borne
-    assert abs((toughness - env.recall(rows, "exposure")).mean() - 1) < 0.1
-    assert (before == before[0]).all()
+    redrawn = audit.redraw_thresholds(env, rows, np.random.default_rng(0))
+    threshold = env.get_field("hazard_threshold", redrawn)
+    assert np.unique(threshold[:, 0]).size == 400
+    # exponential again: mean 1 above the hazard so far
+    assert abs((threshold - env.get_field("cumulative_hazard", rows)).mean() - 1) < 0.1
+    assert (env.get_field("hazard_threshold", rows) == env.get_field("hazard_threshold", rows[:1])).all()
     assert settings.task == env.spec.task
 
 

@@ -1,5 +1,6 @@
 """Claims on folders: one process at a time, dead ones give way at once, silent ones after the lease."""
 
+import json
 import os
 import random
 import signal
@@ -41,8 +42,8 @@ while True:
     busy = folder / "busy"
     try:
         other = int(busy.read_text())
-        os.kill(other, 0)
-        Path(sys.argv[1], f"{os.getpid()}-{other}").touch()
+        if Path(f"/proc/{other}/stat").read_text().rpartition(") ")[2][0] not in "ZX":  # dead, not yet buried
+            Path(sys.argv[1], f"{os.getpid()}-{other}").touch()
     except (FileNotFoundError, ProcessLookupError, ValueError):
         pass
     busy.write_text(str(os.getpid()))
@@ -68,10 +69,8 @@ def kill(process: subprocess.Popen) -> None:
 
 def foreign(folder: Path) -> None:
     """Turn a claim into one of a machine that nobody can ask."""
-    path = folder / CLAIM
-    lines = [f"host={name}" if (name := "elsewhere") and line.startswith("host=") else line
-             for line in path.read_text().splitlines()]  # fmt: skip
-    path.write_text("\n".join(lines) + "\n")
+    (path,) = folder.glob(f"{CLAIM}*")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"host": "elsewhere"}))
 
 
 def test_a_held_folder_is_refused_with_its_owner_and_a_dead_ones_is_free(tmp_path: Path) -> None:
@@ -91,7 +90,8 @@ def test_a_held_folder_is_refused_with_its_owner_and_a_dead_ones_is_free(tmp_pat
         found = owner(tmp_path)
         assert found is not None
         assert found.pid == os.getpid()
-    assert list(tmp_path.iterdir()) == []
+    assert owner(tmp_path) is None
+    assert len(list(tmp_path.iterdir())) == 1, "one small file stays"
 
 
 def test_a_silent_claim_of_another_machine_is_taken_over_after_the_lease(tmp_path: Path, monkeypatch) -> None:
@@ -103,7 +103,7 @@ def test_a_silent_claim_of_another_machine_is_taken_over_after_the_lease(tmp_pat
     while time.monotonic() < began + 3:  # twice the lease; it is renewed all the time
         assert not ours.take()
         time.sleep(0.1)
-    theirs._lease._stop_heartbeat()  # the machine is gone
+    theirs._stop.set()  # the machine is gone
     began = time.monotonic()
     while not ours.take():
         assert time.monotonic() < began + 20

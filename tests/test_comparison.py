@@ -12,10 +12,12 @@ from typer.testing import CliRunner
 from hipg_bench.cli import app
 from hipg_bench.comparison import claims, page
 from hipg_bench.comparison.artefacts import BUNDLES, bundle_name
-from hipg_bench.comparison.figures import FAMILIES, band_of, draw_all
+from hipg_bench.comparison.cards import _SUMMARIES
+from hipg_bench.comparison.figures import _ALGORITHMS, FAMILIES, band_of, draw_all
 from hipg_bench.comparison.improvement import Improvement, improvement
 from hipg_bench.comparison.traces import Trace, blocks, traces
-from hipg_bench.errors import HipgError
+from hipg_bench.errors import BundleError, HipgError
+from hipg_bench.learning.settings import ALGORITHMS
 from hipg_bench.registry import task_spec, tasks
 
 STEPS = np.linspace(1e4, 1e6, 50)
@@ -333,9 +335,14 @@ def test_what_cannot_be_drawn_is_said(tmp_path: Path) -> None:
     assert draw_all([], tmp_path / "none") == []
 
 
-def test_every_task_and_arm_that_is_named_exists() -> None:
+def test_every_task_and_algorithm_that_is_named_exists() -> None:
     shown = {task for panels in FAMILIES.values() for task in panels}
     compared = {task for suite in claims.SUITES.values() for task in suite}
     assert shown | compared <= set(tasks())
-    assert len({bundle_name(algorithm) for algorithm in BUNDLES}) == 5
+    assert set(ALGORITHMS) == set(BUNDLES) == set(_SUMMARIES) == set(_ALGORITHMS), (
+        "all can be collected and drawn"
+    )
+    assert len({bundle_name(algorithm) for algorithm in BUNDLES}) == len(BUNDLES)
+    with pytest.raises(BundleError, match="own credit rules"):
+        bundle_name("my_rules:half_shared")
     assert bundle_name("central-masked_batch") == "mappo_central_masked_batch"

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from hipg_bench import BatchEnv, make
-from hipg_bench.families.drones import pack
-from hipg_bench.layout import Block, Layout
 from hipg_bench.policies.scripted import Scripted
 
 
@@ -17,12 +15,8 @@ def relay(num_agents: int, **overrides: object) -> BatchEnv:
 
 def arrange(env: BatchEnv, drones: list[list[float]], markers: list[list[float]], dead: tuple[int, ...] = ()):
     """Put drones at rest and markers in place, far from any hazard unless a marker says so."""
-    sim = env._sim
-    sim.position[0] = np.ravel(drones)
-    sim.velocity[0] = 0.0
-    sim.marker[0] = markers
-    rows = env.fork(env.rows, dict.fromkeys(dead, 0.0))
-    return env.load_rows(np.array([0]), rows)
+    env.arrange(position=drones, velocity=0.0, terminal=markers[:2], hazard=markers[2])
+    return env.load_rows(np.array([0]), env.fork(env.rows, dict.fromkeys(dead, 0.0)))
 
 
 FAR = [0.0, 5.0, 0.5]
@@ -32,7 +26,7 @@ ENDS = [[-1.0, 0, 0.5], [1.0, 0, 0.5]]
 def test_top_speed_is_thrust_over_drag() -> None:
     env = make("hazard_nav-4", half_width=10.0, hazards=0)
     env.reset()
-    env._sim.position[0] = np.ravel([[0, y, 0.5] for y in range(4)])
+    env.arrange(position=[[0, y, 0.5] for y in range(4)])
     for _ in range(25):
         step = env.step(np.tile([1.0, 0, 0], (1, 4, 1)))
     speed = env.layout.state.view(step.info["state"], "velocity")[0]
@@ -98,8 +92,7 @@ def test_the_hazard_lies_across_the_straight_chain() -> None:
     env = make("hazard_comm-10", num_envs=256, threads=1)
     env.reset()
     params = env.spec.params
-    for row in env._sim.marker:
-        a, b, hazard = row
+    for (a, b), hazard in zip(env.get_field("terminal"), env.get_field("hazard"), strict=True):
         line = (b - a) / np.linalg.norm(b - a)
         aside = np.linalg.norm(hazard - a - ((hazard - a) @ line) * line)
         # half the chord that the line cuts out of the sphere
@@ -121,18 +114,3 @@ def test_the_expert_beats_random_by_far(task: str) -> None:
             step = env.step(action)
         returns[name] = step.info["metrics"]["return"]
     assert returns["expert"].min() > np.median(returns["random"])
-
-
-@pytest.mark.parametrize("lead", [(5, 3), (64, 3), (4,)])
-def test_packing_with_the_worlds_last_is_packing(lead: tuple[int, ...]) -> None:
-    layout = Layout((Block("a", (1,), "1"), Block("b", (2, 3), "m"), Block("c", (4,), "m")))
-    rng = np.random.default_rng(0)
-    parts = {block.name: rng.normal(size=(*lead, *block.shape)) for block in layout.blocks}
-    # lead axes in reverse behind the block's: (B, N, *shape) becomes (*shape, N, B)
-    turned = {
-        name: np.moveaxis(part, range(len(lead)), range(-1, -1 - len(lead), -1))
-        for name, part in parts.items()
-    }
-    assert (pack(layout, turned, lead) == layout.pack(parts, lead)).all()
-    with pytest.raises(ValueError, match="do not match the blocks"):
-        pack(layout, {"a": turned["a"]}, lead)

@@ -23,20 +23,23 @@ def test_chance_is_a_stream_of_ones_own_per_episode(seed: int, episodes: list[in
         assert row.tolist() == stream.random(size).tolist()
 
 
-def test_common_metrics_by_hand():
-    never = episode.NEVER
-    field = {
-        "death_time": np.array([[never, never], [9.0, never], [4.0, 2.0]]),
-        "elapsed": np.array([[5.0], [10.0], [20.0]]),
-        "return": np.array([[-1.0], [2.5], [0.0]]),
-    }
-    metrics = episode.measure(field, np.array([0, 2, 1]))
-    assert metrics.keys() == set(episode.METRICS)
-    assert metrics["return"].tolist() == [-1.0, 0.0, 2.5]
-    assert metrics["length"].tolist() == [5.0, 20.0, 10.0]
-    assert metrics["survival"].tolist() == [1.0, 0.0, 0.5]
-    assert metrics["deaths"].tolist() == [0.0, 2.0, 1.0]
-    np.testing.assert_array_equal(metrics["first_death"], [np.nan, 2.0, 9.0])
+@pytest.mark.parametrize(
+    ("died_at", "expected"),
+    [({}, (1.0, 0.0, np.nan)), ({0: 9.0, 2: 4.0}, (0.5, 2.0, 4.0)), ({1: 2.0}, (0.75, 1.0, 2.0))],
+)
+def test_common_metrics_by_hand(died_at: dict[int, float], expected: tuple[float, float, float]):
+    """Four drones in the last step of an episode of ten, some of whom died before."""
+    env = make("hazard_nav-4", 1, threads=1, horizon=10, hazard_peak=0.0)
+    env.reset()
+    times, health = np.full(4, -1.0), np.ones(4)
+    for agent, time in died_at.items():
+        times[agent], health[agent] = time, 0.0
+    env.arrange(elapsed=9.0, episode_return=-3.5, death_time=times, health=health)
+    step = env.step(np.zeros((1, 4, 3)))
+    metrics = {name: value[0] for name, value in step.info["metrics"].items()}
+    assert (metrics["length"], metrics["return"]) == (10.0, -3.5 + step.reward[0])
+    found = metrics["survival"], metrics["deaths"], metrics["first_death"]
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("task", ["hazard_nav-4", "hazard_comm-10", "multiwalker-3", "paper_nav-4"])

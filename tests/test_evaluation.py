@@ -112,7 +112,7 @@ def test_an_episode_played_again_alone_is_the_same():
     states = job.record(spec, policy, row)
     assert len(states) == row["length"] + 1
     env = make(TASK)
-    np.testing.assert_array_equal(env.recall(states, "elapsed")[:, 0], np.arange(51))
+    np.testing.assert_array_equal(env.get_field("elapsed", states), np.arange(51))
     with pytest.raises(HipgError, match="played again"):
         job.record(spec, policy, row | {"reached": row["reached"] + 1e-9})
 
@@ -235,7 +235,7 @@ def test_films_are_of_the_median_then_from_worst_to_best(tmp_path):
     returns = np.sort([row["return"] for row in rows])
     assert [film.file for film in chosen] == [f"videos/{TASK}{end}.mp4" for end in ("", "-q000", "-q100")]
     env = make(TASK)
-    filmed = [env.recall(np.load(film.saved)["rows"][-1:], "return")[0, 0] for film in chosen]
+    filmed = [env.get_field("episode_return", np.load(film.saved)["rows"][-1:])[0] for film in chosen]
     assert filmed == [returns[10], returns[0], returns[-1]]
     # a longer evaluation has another median episode: its film replaces the old one, and only that
     for film in chosen:

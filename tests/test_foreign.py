@@ -84,7 +84,7 @@ def test_the_agent_is_told_the_task_and_its_training_seed_and_nothing_of_the_wor
     told, began, saw, _ = (json.loads(line) for line in bytes(session.child.words).decode().splitlines())
     task, train_seed, environment = told
     assert train_seed == 3
-    layout = registry.family_of(TASK).layout
+    layout = registry.definition_of(TASK).layout
     assert {key: task[key] for key in ("name", "num_agents", "observation_size", "action_size")} == {
         "name": "hazard_nav-4", "num_agents": 4, "observation_size": SEEN, "action_size": A,
     }  # fmt: skip

@@ -93,7 +93,7 @@ def check(kind, good, chance, place):
         load_network(path)
     elif kind == "curve":
         path.write_bytes(mutated_text(good["curve"], chance))
-        list(_points(path))
+        list(_points(path, "return"))
     elif kind == "zip":
         path.write_bytes(mutated_zip(good["zip"], chance, place))
         archive.unpack(path, place / "unpacked")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +12,8 @@ from hypothesis import strategies as st
 from play import actions
 
 from hipg_bench import BatchEnv, make
-from hipg_bench.mechanics import health
+from hipg_bench.engine import apply_damage
+from hipg_bench.mechanics import hazards
 
 SEEDS = st.integers(0, 2**32 - 1)
 LEVELS = (1.0, 0.75, 0.25, 0.0)
@@ -17,71 +21,83 @@ LEVELS = (1.0, 0.75, 0.25, 0.0)
 TASKS = ["hazard_nav-4", "hazard_comm-10", "multiwalker-3"]
 
 
+def damage(health, cumulative_hazard, threshold, gained, fatal, *, graded):
+    """Health and cumulative hazard (N,) after one step of the engine's rule."""
+    w = SimpleNamespace(
+        health=health.copy(), cumulative_hazard=cumulative_hazard.copy(), hazard_threshold=threshold,
+        elapsed=1.0, death_time=np.full(len(health), -1.0), death_cause=np.zeros(len(health)),
+    )  # fmt: skip
+    scratch = SimpleNamespace(harm=gained, fatal=fatal, cause=np.ones(len(health)))
+    for i in range(len(health)):
+        inspect.unwrap(apply_damage)(w, scratch, SimpleNamespace(graded_health=graded), i)
+    return w.health, w.cumulative_hazard
+
+
 def harm(seed: int, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Toughness (1, N), exposure gained (steps, 1, N), killed outright (steps, 1, N) of ten agents."""
+    """Hazard threshold (N,), hazard gained (steps, N), killed outright (steps, N) of ten agents."""
     rng = np.random.default_rng(seed)
-    gained = rng.exponential(0.2, (steps, 1, 10)) * (rng.random((steps, 1, 10)) < 0.5)
-    return rng.exponential(1.0, (1, 10)), gained, rng.random((steps, 1, 10)) < 0.02
+    gained = rng.exponential(0.2, (steps, 10)) * (rng.random((steps, 10)) < 0.5)
+    return rng.exponential(1.0, 10), gained, rng.random((steps, 10)) < 0.02
 
 
 @given(SEEDS, st.booleans())
 def test_health_falls_for_good(seed: int, graded: bool):
-    toughness, gained, fatal = harm(seed, 30)
-    now, exposure = np.ones((1, 10)), np.zeros((1, 10))
+    threshold, gained, fatal = harm(seed, 30)
+    now, hazard = np.ones(10), np.zeros(10)
     for gain, kill in zip(gained, fatal, strict=True):
-        was, had = now, exposure
-        now, exposure = health.damage(was, had, toughness, gain, kill, graded=graded)
+        was, had = now, hazard
+        now, hazard = damage(was, had, threshold, gain, kill, graded=graded)
         assert (now <= was).all()
         assert ((now >= 0) & (now <= 1)).all()
         assert (now[kill] == 0).all()
         assert (now[was == 0] == 0).all()
-        assert (exposure[was == 0] == had[was == 0]).all(), "the dead gather nothing"
+        assert (hazard[was == 0] == had[was == 0]).all(), "the dead gather nothing"
         if not graded:
             assert np.isin(now, (0.0, 1.0)).all()
         else:
-            # the share of toughness left, by hand: whoever lives has 1 - exposure / toughness
+            # the share of threshold left, by hand: whoever lives has 1 - hazard / threshold
             alive = now > 0
-            np.testing.assert_allclose(now[alive], (1 - exposure / toughness)[alive], rtol=1e-12)
+            np.testing.assert_allclose(now[alive], (1 - hazard / threshold)[alive], rtol=1e-12)
 
 
 @given(SEEDS)
 def test_grading_changes_no_death(seed: int):
-    toughness, gained, fatal = harm(seed, 30)
+    threshold, gained, fatal = harm(seed, 30)
     fates = []
     for graded in (False, True):
-        now, exposure = np.ones((1, 10)), np.zeros((1, 10))
+        now, hazard = np.ones(10), np.zeros(10)
         for gain, kill in zip(gained, fatal, strict=True):
-            now, exposure = health.damage(now, exposure, toughness, gain, kill, graded=graded)
+            now, hazard = damage(now, hazard, threshold, gain, kill, graded=graded)
         fates.append(now == 0)
     assert (fates[0] == fates[1]).all()
 
 
 @given(SEEDS, st.floats(1.0, 5.0))
 def test_more_harm_never_helps(seed: int, factor: float):
-    toughness, gained, fatal = harm(seed, 20)
-    one = two = np.ones((1, 10))
-    less = more = np.zeros((1, 10))
+    threshold, gained, fatal = harm(seed, 20)
+    one = two = np.ones(10)
+    less = more = np.zeros(10)
     for gain, kill in zip(gained, fatal, strict=True):
-        one, less = health.damage(one, less, toughness, gain, kill, graded=True)
-        two, more = health.damage(two, more, toughness, factor * gain, kill, graded=True)
+        one, less = damage(one, less, threshold, gain, kill, graded=True)
+        two, more = damage(two, more, threshold, factor * gain, kill, graded=True)
         assert (two <= one).all()
 
 
 def test_survival_is_the_product_of_coins():
-    """Toughness drawn once against a plain loop that flips one coin per step.
+    """Hazard threshold drawn once against a plain loop that flips one coin per step.
 
     Both counts of survivors of M agents are binomial with the exact chance prod(1 - p); 4.5 standard
     errors hold with probability 0.99999 per comparison.
     """
     m, risks = 40_000, (0.05, 0.3, 0.0, 0.12, 0.4)
     rng = np.random.default_rng(5)
-    now, exposure = np.ones((1, m)), np.zeros((1, m))
-    toughness, nobody = rng.exponential(1.0, (1, m)), np.zeros((1, m), bool)
+    now, hazard = np.ones(m), np.zeros(m)
+    threshold, nobody = rng.exponential(1.0, m), np.zeros(m, bool)
     coins = np.ones(m, bool)
     chance = 1.0
     for p in risks:
-        gained = health.hazard_rate(np.full((1, m), p), 1.0)
-        now, exposure = health.damage(now, exposure, toughness, gained, nobody, graded=False)
+        gained = np.full(m, inspect.unwrap(hazards.hazard_rate)(p, 1.0))
+        now, hazard = damage(now, hazard, threshold, gained, nobody, graded=False)
         coins &= rng.random(m) >= p
         chance *= 1 - p
         error = np.sqrt(chance * (1 - chance) / m)
@@ -106,7 +122,7 @@ def moved(env: BatchEnv, rows: np.ndarray, told: np.ndarray) -> np.ndarray:
     """(4, nq) where the worlds are one step after being told something."""
     env.load_rows(np.arange(4), rows)
     env.step(told)
-    return env._sim.position.copy()
+    return env.get_field("position" if "position" in env.fields else "coordinate")
 
 
 @settings(max_examples=8, deadline=None)

@@ -127,7 +127,7 @@ def test_metrics_tell_of_ended_episodes_and_of_nothing_else(recording: Recording
         total += now.reward
         done = now.terminated | now.truncated
         metrics = now.info["metrics"]
-        for name in ("return", "length", "survival", "deaths", *recording.env.family.metrics):
+        for name in ("return", "length", "survival", "deaths", *recording.env.definition.metrics):
             # what tells of an event is undefined where it never happened
             assert name in EVENTS or np.isfinite(metrics[name][done]).all(), name
             assert np.isnan(metrics[name][~done]).all(), name

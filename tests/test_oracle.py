@@ -91,7 +91,7 @@ class NavigationByHand:
         self.speed = [[self.data.joint(f"drone{i}/{axis}").qvel[0] for axis in "xyz"] for i in range(self.n)]
         self.point = [self.data.body(f"point{p}/marker").xpos.tolist() for p in range(self.n)]
         remembered = {
-            name: self.env.recall(row[None], name)[0] for name in ("health", "hazardous", "revealed")
+            name: self.env.get_field(name, row[None])[0] for name in ("health", "hazardous", "revealed")
         }
         self.health = remembered["health"].tolist()
         self.hazardous = remembered["hazardous"].tolist()
@@ -164,11 +164,11 @@ def test_navigation_by_hand(navigation: BatchEnv):
 
 
 def test_navigation_deaths_by_hand(navigation: BatchEnv):
-    """An agent dies in the step in which its summed -log(1 - p) reaches its toughness."""
+    """An agent dies in the step in which its summed -log(1 - p) reaches its hazard threshold."""
     env, by_hand = navigation, NavigationByHand(navigation)
     step = env.reset()
-    toughness = env.recall(env.rows, "toughness").copy()
-    exposure = np.zeros_like(toughness)
+    threshold = env.get_field("hazard_threshold")
+    hazard = np.zeros_like(threshold)
     for _ in range(49):
         alive = step.info["alive"]
         step = env.step(actions(env, step))
@@ -180,30 +180,30 @@ def test_navigation_deaths_by_hand(navigation: BatchEnv):
                 for p in range(env.num_agents):
                     share = math.dist(by_hand.drone[i], by_hand.point[p]) / env.spec.params["hazard_radius"]
                     if by_hand.hazardous[p] and share < 1:
-                        exposure[world, i] -= math.log(1 - env.spec.params["hazard_peak"] * (1 - share**2))
-                lives = exposure[world, i] < toughness[world, i]
+                        hazard[world, i] -= math.log(1 - env.spec.params["hazard_peak"] * (1 - share**2))
+                lives = hazard[world, i] < threshold[world, i]
                 assert step.info["alive"][world, i] == lives
-    assert (exposure >= toughness).any()
+    assert (hazard >= threshold).any()
 
 
-def test_toughness_is_exponential():
+def test_hazard_thresholds_are_exponential():
     """By Kolmogorov and Smirnov: 2,000 draws of Exp(1); the critical distance at 0.001 is 1.95 / sqrt(n)."""
     env = make("hazard_nav-4", 500, threads=1)
     env.reset()
-    drawn = np.sort(env.recall(env.rows, "toughness").ravel())
+    drawn = np.sort(env.get_field("hazard_threshold").ravel())
     law, n = 1 - np.exp(-drawn), len(drawn)
     gap = max(np.abs(law - np.arange(n) / n).max(), np.abs(law - np.arange(1, n + 1) / n).max())
     assert gap < 1.95 / math.sqrt(n)
 
 
 def test_deaths_do_not_depend_on_who_else_is_there():
-    """Paired random numbers: what one agent does cannot change another's toughness."""
+    """Paired random numbers: what one agent does cannot change another's hazard threshold."""
     env = make("hazard_nav-4", 2, threads=1)
     env.reset(np.array([5, 5]))
-    first = env.recall(env.rows, "toughness").copy()
+    first = env.get_field("hazard_threshold")
     assert same(first[0], first[1])
     play(env, env.reset(np.array([5, 6])), 3)
-    assert same(env.recall(env.rows, "toughness")[0].copy(), first[0])
+    assert same(env.get_field("hazard_threshold")[0].copy(), first[0])
 
 
 @pytest.mark.parametrize("alive", [True, False])
@@ -211,14 +211,15 @@ def test_the_dead_reveal_nothing(alive: bool):
     """Agent 0 is put on the hazard, all others out of its reach, and agent 0 may be dead already."""
     env = make("hazard_nav-4", 1, threads=1)
     env.reset()
-    (hazard,) = np.flatnonzero(env.recall(env.rows, "hazardous")[0])
-    place = env._sim.position.reshape(4, 3)
-    centre = env._sim.marker[0, hazard]
+    (hazard,) = np.flatnonzero(env.get_field("hazardous")[0])
+    place = env.get_field("position")[0]
+    centre = env.get_field("point")[0, hazard]
     corners = np.array([[x, y, 0.1] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
     far = corners[np.argsort(-np.linalg.norm(corners - centre, axis=1))]
     place[0], place[1:] = centre, far[:3]
-    env.load_rows(np.array([0]), env.fork(env.rows, {} if alive else {0: 0.0}))
-    assert env.recall(env.rows, "revealed").sum() == 0
+    rows = env.set_field(env.rows, "position", place[None])
+    env.load_rows(np.array([0]), env.fork(rows, {} if alive else {0: 0.0}))
+    assert env.get_field("revealed").sum() == 0
     env.step(np.zeros((1, 4, 3)))
-    assert env.recall(env.rows, "revealed")[0, hazard] == alive
-    assert env.recall(env.rows, "revealed").sum() == alive
+    assert env.get_field("revealed")[0, hazard] == alive
+    assert env.get_field("revealed").sum() == alive

@@ -1,6 +1,7 @@
 """The page in a real browser, from a folder: it sorts, filters and plays, and believes no submitter."""
 
 import json
+import os
 import re
 import shutil
 import socket
@@ -415,6 +416,60 @@ def test_files_that_somebody_added_to_a_site_stay(board, tmp_path):
     assert (site / "CNAME").read_text() == "bench.example.org"
     assert (site / ".git" / "config").read_text() == "mine"
     assert (site / "index.html").exists()
+
+
+def contents(folder):
+    """Every path in a folder, with the bytes of files and the targets of links."""
+    return {
+        path.relative_to(folder): os.readlink(path)
+        if path.is_symlink()
+        else path.is_file() and path.read_bytes()
+        for path in folder.rglob("*")
+    }
+
+
+def test_empty_folders_and_links_of_others_stay(board, tmp_path):
+    real, site = tmp_path / "real", tmp_path / "site"
+    site.symlink_to(real)
+    real.mkdir()
+    build(board, site)
+    (real / ".git" / "refs" / "tags").mkdir(parents=True)
+    (real / "mine").symlink_to("nowhere")
+    (real / "agents" / "notes.txt").write_text("mine")
+    made = contents(real)
+    build(board, site)
+    assert site.is_symlink()
+    assert contents(real) == made
+
+
+@pytest.mark.parametrize(
+    "mark", [b"\xff\xfe", b"", b"somebody's\n", b"made by hipg-bench leaderboard build\n../x\n"]
+)
+def test_a_damaged_mark_of_a_site_loses_no_file(board, tmp_path, mark):
+    site = tmp_path / "site"
+    build(board, site)
+    (tmp_path / "x").write_text("mine")
+    (site / "CNAME").write_text("mine")
+    (site / "hipg-bench-site").write_bytes(mark)
+    before = contents(tmp_path)
+    with pytest.raises(BoardError):
+        build(board, site)
+    assert contents(tmp_path) == before
+
+
+def test_pages_of_entries_that_are_gone_go_and_files_of_others_are_not_overwritten(board, tmp_path):
+    shutil.copytree(board.root, tmp_path / "board")
+    own, site = Board(tmp_path / "board"), tmp_path / "site"
+    build(own, site)
+    shutil.rmtree(own.root / "entries" / "steady")
+    build(own, site)
+    assert not (site / "agents" / "steady.html").exists()
+    assert not (site / "data" / "steady" / "entry.json").exists()
+    (site / "agents" / "steady.html").write_text("mine")
+    before = contents(site)
+    with pytest.raises(BoardError, match=r"steady\.html is not of an earlier build"):
+        build(board, site)
+    assert contents(site) == before
 
 
 @pytest.mark.parametrize(

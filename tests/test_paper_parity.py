@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 import hipg_bench
-from hipg_bench.mechanics import histogram
+from hipg_bench.mechanics import plane
 
 DT = 0.1
 
@@ -20,17 +20,26 @@ DT = 0.1
 def arrange(env, position, *, velocity=0.0, dead=(), marker=None, **fields):
     """Put all worlds of a fresh episode into a given state and look at it."""
     env.reset()
-    sim = env._sim
-    sim.position[:] = np.asarray(position, float).reshape(-1, 2 * env.num_agents)
-    sim.velocity[:] = (
-        np.asarray(velocity, float).reshape(-1, 2 * env.num_agents) if np.ndim(velocity) else velocity
-    )
-    sim.field["health"][:, list(dead)] = 0.0
+    agents = (env.num_envs, env.num_agents, 2)
+    health, point = env.get_field("health"), env.get_field("point")
+    health[:, list(dead)] = 0.0
     if marker is not None:
-        sim.marker[..., :2] = marker
-    for name, value in fields.items():
-        sim.field[name][:] = value
-    return env.load_rows(np.arange(env.num_envs), env.rows)
+        point[..., :2] = marker
+    return env.arrange(
+        position=np.asarray(position, float).reshape(-1, *agents[1:]),
+        velocity=np.asarray(velocity, float).reshape(-1, *agents[1:]) if np.ndim(velocity) else velocity,
+        health=health, point=point, **fields,
+    )  # fmt: skip
+
+
+def flat(env, name):
+    """What worlds hold under a name, (B, numbers)."""
+    return env.get_field(name).reshape(env.num_envs, -1)
+
+
+def link_range(env):
+    """How far a team hears, m."""
+    return env.definition.family.link_range(env.spec, env.definition.params)
 
 
 def still(env):
@@ -55,8 +64,8 @@ def test_one_agent_follows_the_authors_recursion():
         env.step(force[t])
         v = 0.75 * v + DT * force[t]
         x = x + DT * v
-        assert np.abs(env._sim.velocity.reshape(3, 4, 2) - v).max() < 1e-12
-        assert np.abs(env._sim.position.reshape(3, 4, 2) - x).max() < 1e-12
+        assert np.abs(flat(env, "velocity").reshape(3, 4, 2) - v).max() < 1e-12
+        assert np.abs(flat(env, "position").reshape(3, 4, 2) - x).max() < 1e-12
 
 
 def test_unit_force_gives_the_speeds_and_distances_of_the_authors_code():
@@ -65,7 +74,7 @@ def test_unit_force_gives_the_speeds_and_distances_of_the_authors_code():
     speed, distance = {}, {}
     for t in range(1, 51):
         env.step(np.broadcast_to([1.0, 0.0], (1, 4, 2)))
-        speed[t], distance[t] = env._sim.velocity[0, 0], env._sim.position[0, 0]
+        speed[t], distance[t] = flat(env, "velocity")[0, 0], flat(env, "position")[0, 0]
     assert [round(speed[t], 3) for t in (1, 2, 5, 10, 20)] == [0.1, 0.175, 0.305, 0.377, 0.399]
     assert [round(distance[t], 3) for t in (10, 25, 50)] == [0.287, 0.880, 1.880]
     # 0.1 F / (1 - 0.75) = 0.4 F
@@ -76,7 +85,7 @@ def test_actions_are_forces_in_newtons_and_not_clipped():
     env = hipg_bench.make("paper_comm-10", num_envs=1, threads=1)
     arrange(env, [[[0, 9 * i] for i in range(10)]])
     env.step(np.broadcast_to([-7.5, 0.0], (1, 10, 2)))
-    assert env._sim.velocity[0, 0] == pytest.approx(-0.75, abs=1e-12)
+    assert flat(env, "velocity")[0, 0] == pytest.approx(-0.75, abs=1e-12)
 
 
 @pytest.mark.parametrize("task", ["paper_nav-4", "paper_comm-10"])
@@ -90,12 +99,12 @@ def test_overlapping_agents_push_each_other_apart(task, depth):
     away = np.array([math.cos(angle), math.sin(angle)])
     place = np.array([[0.0, 50.0 * i] for i in range(env.num_agents)])
     place[1] = distance * away
-    arrange(env, place[None], toughness=np.inf)
+    arrange(env, place[None], hazard_threshold=np.inf)
     env.step(still(env))
     z = (2 * radius - distance) / 1e-3
     softplus = z + math.log1p(math.exp(-z)) if z > 0 else math.log1p(math.exp(z))
     force = 100.0 * 1e-3 * softplus
-    velocity = env._sim.velocity.reshape(-1, 2)
+    velocity = flat(env, "velocity").reshape(-1, 2)
     np.testing.assert_allclose(velocity[1], DT * force * away, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(velocity[0], -DT * force * away, rtol=1e-12, atol=1e-12)
     assert not velocity[2:].any()
@@ -109,7 +118,7 @@ def test_an_agent_between_two_others_feels_both():
     # deep inside, softplus(z) = z: 100 N per m of overlap
     from_right, from_left = 100 * (reach - 0.2), 100 * (reach - math.sqrt(0.02))
     expected = [-from_right + from_left / math.sqrt(2), -from_left / math.sqrt(2)]
-    np.testing.assert_allclose(env._sim.velocity[0, :2], DT * np.array(expected), rtol=1e-9)
+    np.testing.assert_allclose(flat(env, "velocity")[0, :2], DT * np.array(expected), rtol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------ the dead
@@ -123,17 +132,17 @@ def test_the_dead_stand_still_at_once_and_keep_their_stored_velocity():
     # the hazard is where agent 0 is after its first step
     v = 0.75 * 0.8 + DT * 1.0
     arrange(
-        env, place[None], velocity=np.tile([0.8, 0.0], 10)[None], toughness=toughness,
+        env, place[None], velocity=np.tile([0.8, 0.0], 10)[None], hazard_threshold=toughness,
         marker=[[-1, -9], [1, -9], [DT * v, 0.0]],
     )  # fmt: skip
     push = np.broadcast_to([1.0, 0.0], (1, 10, 2))
     step = env.step(push)
     assert step.info["health"][0].tolist() == [0.0] + [1.0] * 9
-    frozen = env._sim.position[0, :2].copy()
+    frozen = flat(env, "position")[0, :2].copy()
     for _ in range(5):
         step = env.step(push)
-        assert (env._sim.position[0, :2] == frozen).all()
-        assert not env._sim.velocity[0, :2].any()
+        assert (flat(env, "position")[0, :2] == frozen).all()
+        assert not flat(env, "velocity")[0, :2].any()
         stored = env.layout.state.view(step.info["state"], "velocity")[0]
         np.testing.assert_allclose(stored[0], [v, 0.0], rtol=1e-6)
         assert stored[1, 0] != pytest.approx(v, rel=1e-3)  # the living go on
@@ -143,9 +152,9 @@ def test_the_dead_are_passed_through_and_do_not_die_again():
     env = hipg_bench.make("paper_comm-10", num_envs=1, threads=1)
     place = np.array([[0.0, 50.0 * i] for i in range(10)])
     place[1] = [0.005, 0.0]
-    arrange(env, place[None], dead=[0], toughness=0.01)
+    arrange(env, place[None], dead=[0], hazard_threshold=0.01)
     step = env.step(still(env))
-    assert not env._sim.velocity.any()
+    assert not flat(env, "velocity").any()
     assert step.info["health"][0].sum() == 9  # contact with a dead agent kills nobody
 
 
@@ -154,12 +163,12 @@ def test_a_fork_in_which_a_moving_agent_dies_stops_it():
     env.reset()
     for _ in range(3):
         env.step(np.ones((1, 4, 2)))
-    before = env._sim.position[0].copy()
+    before = flat(env, "position")[0].copy()
     step = env.load_rows(np.array([0]), env.fork(env.rows, {2: 0.0}))
     stored = env.layout.state.view(step.info["state"], "velocity")[0, 2].copy()
     step = env.step(np.ones((1, 4, 2)))
-    assert (env._sim.position[0, 4:6] == before[4:6]).all()
-    assert (env._sim.position[0, :4] != before[:4]).all()
+    assert (flat(env, "position")[0, 4:6] == before[4:6]).all()
+    assert (flat(env, "position")[0, :4] != before[:4]).all()
     assert (env.layout.state.view(step.info["state"], "velocity")[0, 2] == stored).all()
     assert stored.any()
 
@@ -206,14 +215,14 @@ def test_a_contact_kills_each_partner_with_probability_seven_tenths_independentl
     step = env.step(still(env))
     dead = ~step.info["alive"]
     assert not dead[:, 2:].any()
-    gap = np.linalg.norm(env._sim.position[:, :2] - env._sim.position[:, 2:4], axis=1)
+    gap = np.linalg.norm(flat(env, "position")[:, :2] - flat(env, "position")[:, 2:4], axis=1)
     assert (gap < 0.02).all()
     error = math.sqrt(0.7 * 0.3 / worlds)
     assert abs(dead[:, 0].mean() - 0.7) < 4 * error
     assert abs(dead[:, 1].mean() - 0.7) < 4 * error
     both = (dead[:, 0] & dead[:, 1]).mean()
     assert abs(both - 0.49) < 4 * math.sqrt(0.49 * 0.51 / worlds)
-    assert (env.recall(env.rows, "death_cause")[dead] == env.family.causes.index("collision")).all()
+    assert (env.get_field("death_cause")[dead] == env.definition.causes.index("collision")).all()
 
 
 def test_collisions_kill_nobody_in_navigation():
@@ -244,13 +253,13 @@ def test_navigation_pays_what_the_authors_pay(task):
     env = hipg_bench.make(task, num_envs=worlds, threads=1, contact_stiffness=0.0)
     n = env.num_agents
     place = np.random.default_rng(3).uniform(-0.3, 0.3, (worlds, n, 2))
-    arrange(env, place, dead=[1], toughness=np.inf)
+    arrange(env, place, dead=[1], hazard_threshold=np.inf)
     step = env.step(still(env))
     radius = 0.15 * math.sqrt(3 / n)
-    position = env._sim.position.reshape(worlds, n, 2)
+    position = flat(env, "position").reshape(worlds, n, 2)
     for b in range(worlds):
         alive = np.arange(n) != 1
-        points, hazardous = env._sim.marker[b, :, :2], env._sim.field["hazardous"][b]
+        points, hazardous = env.get_field("point")[b, :, :2], flat(env, "hazardous")[b]
         assert len(points) == n + (task != "paper_coop_nav-3")
         assert hazardous.sum() == (task != "paper_coop_nav-3")
         expected = navigation_reward(position[b], alive, points, hazardous, radius)
@@ -305,19 +314,19 @@ def test_communication_pays_for_unbroken_chains_of_the_living(task, reach):
     worlds = 300
     env = hipg_bench.make(task, num_envs=worlds, threads=1, hazard_peak=0.0)
     n = env.num_agents
-    assert env.family.link_range == pytest.approx(reach, abs=5e-5)
+    assert link_range(env) == pytest.approx(reach, abs=5e-5)
     env.reset()
-    terminals = env._sim.marker[:, :2, :2].copy()
+    terminals = env.get_field("point")[:, :2, :2].copy()
     rng = np.random.default_rng(5)
     # agents strewn along the line, so that about half of the worlds are linked
     along = (np.arange(n) + rng.uniform(-0.5, 0.5, (worlds, n))) / (n - 1)
     place = terminals[:, :1] + along[..., None] * (terminals[:, 1:] - terminals[:, :1])
     place += rng.normal(0, 0.08, place.shape)
-    arrange(env, place, dead=[2], marker=env._sim.marker[..., :2].copy())
+    arrange(env, place, dead=[2], marker=env.get_field("point")[..., :2].copy())
     step = env.step(still(env))
-    position = env._sim.position.reshape(worlds, n, 2)
+    position = flat(env, "position").reshape(worlds, n, 2)
     alive = step.info["alive"]
-    linked = [flooded(position[b], alive[b], terminals[b], env.family.link_range) for b in range(worlds)]
+    linked = [flooded(position[b], alive[b], terminals[b], link_range(env)) for b in range(worlds)]
     assert 0.1 < np.mean(linked) < 0.9
     assert step.reward.tolist() == [n * float(x) for x in linked]
 
@@ -366,7 +375,7 @@ def test_lengths_are_the_authors(task, direct, state):
 def test_layouts_at_the_start_follow_the_authors_distributions():
     env = hipg_bench.make("paper_comm-10", num_envs=2000, threads=1)
     env.reset()
-    marker, position = env._sim.marker[..., :2], env._sim.position
+    marker, position = env.get_field("point")[..., :2], flat(env, "position")
     np.testing.assert_allclose(marker[:, 0], -marker[:, 1], atol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(marker[:, 0] - marker[:, 1], axis=1), 2.0)
     along = (marker[:, 2] * marker[:, 1]).sum(axis=1)
@@ -378,8 +387,8 @@ def test_layouts_at_the_start_follow_the_authors_distributions():
     assert abs(position.std() - 1 / math.sqrt(3)) < 0.005
     env = hipg_bench.make("paper_nav-4", num_envs=2000, threads=1)
     env.reset()
-    assert abs(env._sim.marker[..., :2].std() - 1 / math.sqrt(3)) < 0.01
-    share = env._sim.field["hazardous"].mean(axis=0)
+    assert abs(env.get_field("point")[..., :2].std() - 1 / math.sqrt(3)) < 0.01
+    share = flat(env, "hazardous").mean(axis=0)
     assert abs(share - 0.2).max() < 4 * math.sqrt(0.2 * 0.8 / 2000)
 
 
@@ -400,7 +409,7 @@ def counted(observer, things):
 
 
 def test_ring_edges_are_the_authors():
-    assert [round(float(edge), 4) for edge in histogram.EDGES] == [0.1, 0.2154, 0.4642, 1.0]
+    assert [round(float(edge), 4) for edge in plane.EDGES] == [0.1, 0.2154, 0.4642, 1.0]
 
 
 @pytest.mark.parametrize("task", ["paper_nav-4", "paper_nav-8", "paper_comm-10", "paper_coop_nav-3"])
@@ -410,7 +419,7 @@ def test_histograms_count_what_a_plain_loop_counts(task):
     n = env.num_agents
     dead = [1] if n == 3 else [1, 3]
     step = arrange(env, np.random.default_rng(1).uniform(-1, 1, (worlds, n, 2)), dead=dead)
-    position = env._sim.position.reshape(worlds, n, 2)
+    position = flat(env, "position").reshape(worlds, n, 2)
     for b, i in itertools.product(range(worlds), range(n)):
         if i in dead:
             continue
@@ -423,7 +432,7 @@ def test_histograms_count_what_a_plain_loop_counts(task):
         np.testing.assert_allclose(listed[: len(dead)], gaps, atol=1e-6)
         assert not listed[len(dead) :].any()
         if "nav" in task:
-            points = env._sim.marker[b, env._sim.field["revealed"][b] == 0, :2]
+            points = env.get_field("point")[b, flat(env, "revealed")[b] == 0, :2]
             np.testing.assert_array_equal(
                 seen(env, step, "point_count", agent=i, world=b), counted(position[b, i], points)
             )
@@ -498,12 +507,12 @@ def test_a_hazard_is_revealed_to_all_for_good_by_anyone_even_the_dead():
     for observation, dead in itertools.product(("direct", "histogram"), ([], [0])):
         env = hipg_bench.make("paper_nav-4", num_envs=1, threads=1, observation=observation)
         place = [[[0.06, 0.0], [0, 2], [0, 9], [0.4, 0.0]]]
-        step = arrange(env, place, marker=points, hazardous=hazardous, toughness=np.inf)
+        step = arrange(env, place, marker=points, hazardous=hazardous, hazard_threshold=np.inf)
         step = env.step(still(env))
         tag = "point_revealed" if observation == "direct" else "hazard_position"
         assert not seen(env, step, tag, agent=1).any()
         place[0][0] = [0.04, 0.0]
-        arrange(env, place, marker=points, hazardous=hazardous, toughness=np.inf, dead=dead)
+        arrange(env, place, marker=points, hazardous=hazardous, hazard_threshold=np.inf, dead=dead)
         step = env.step(still(env))
         if observation == "direct":
             assert seen(env, step, tag, agent=1).tolist() == [1, 0, 0, 0, 0]
@@ -593,7 +602,9 @@ def formation(places, cap):
     target = []
 
     def act(env, step):
-        position, velocity = (x.reshape(env.num_envs, -1, 2) for x in (env._sim.position, env._sim.velocity))
+        position, velocity = (
+            x.reshape(env.num_envs, -1, 2) for x in (flat(env, "position"), flat(env, "velocity"))
+        )
         if not target:
             goals = places(env)
             for here, goal in zip(position, goals, strict=True):
@@ -605,17 +616,17 @@ def formation(places, cap):
 
 
 def safe_landmarks(env):
-    hazardous = env._sim.field["hazardous"] > 0
-    return env._sim.marker[..., :2][~hazardous].reshape(env.num_envs, -1, 2)
+    hazardous = flat(env, "hazardous") > 0
+    return env.get_field("point")[..., :2][~hazardous].reshape(env.num_envs, -1, 2)
 
 
 def any_landmarks(env):
     # the layout is exchangeable, so the first n of n + 1 landmarks are a random choice
-    return env._sim.marker[:, : env.num_agents, :2]
+    return env.get_field("point")[:, : env.num_agents, :2]
 
 
 def chain(env):
-    ends = env._sim.marker[:, :2, :2]
+    ends = env.get_field("point")[:, :2, :2]
     share = (np.arange(env.num_agents) + 1) / (env.num_agents + 1)
     return ends[:, :1] + share[:, None] * (ends[:, 1:] - ends[:, :1])
 
@@ -663,7 +674,7 @@ def test_live_observations_of_the_dead_are_those_of_the_authors(task):
     n = env.num_agents
     places = np.random.default_rng(3).uniform(-0.7, 0.7, (n, 2))
     step = arrange(env, places[None], velocity=np.full((1, n, 2), 0.25), dead=(0, 2))
-    points = env._sim.marker[0, :, :2]
+    points = env.get_field("point")[0, :, :2]
     for i in (0, 2):
         assert seen(env, step, "terminated", agent=i) == 1
         np.testing.assert_allclose(seen(env, step, "position", agent=i), places[i], atol=1e-6)

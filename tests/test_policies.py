@@ -247,13 +247,11 @@ def test_weights_for_another_task_do_not_fit(network):
 
 def test_a_film_takes_the_first_training_whatever_its_seed(tmp_path: Path) -> None:
     """A team of training seed 1 alone: without being told, a film finds it."""
-    from hipg_bench.cli.media import _policy
-
     bundled = data_folder("agents") / "mappo_minhealth"
     (tmp_path / "hazard_nav-8").mkdir()
     shutil.copy(bundled / "agent.toml", tmp_path)
     shutil.copy(bundled / "hazard_nav-8/seed0.safetensors", tmp_path / "hazard_nav-8/seed1.safetensors")
     who, spec = load_agent(str(tmp_path)), task_spec("hazard_nav-8")
-    assert _policy(who, spec, None).action_size == 3
+    assert who.chosen_policy(spec, None).action_size == 3
     with pytest.raises(BundleError):
-        _policy(who, spec, 0)
+        who.chosen_policy(spec, 0)

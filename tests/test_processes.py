@@ -76,7 +76,7 @@ def test_nothing_is_imported_from_the_working_folder(trap, tmp_path, command):
     sweep = tmp_path / "sweep.toml"
     settings = "{ steps = 8, num_envs = 2, rollout = 4, eval_every = 0 }"
     sweep.write_text(
-        f'[[run]]\ntasks = ["hazard_nav-4"]\narms = ["central"]\nseeds = [0]\nsettings = {settings}\n'
+        f'[[run]]\ntasks = ["hazard_nav-4"]\nalgorithms = ["central"]\nseeds = [0]\nsettings = {settings}\n'
     )
     done = run(trap, str(PROGRAM), *command.format(out=tmp_path / "out", sweep=sweep).split())
     assert "Traceback" not in done.stderr, done.stderr[-2000:]

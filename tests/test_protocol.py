@@ -55,7 +55,13 @@ def test_a_change_is_found_and_named(tmp_path, monkeypatch):
 
 def test_what_decides_an_episode_is_in_the_file():
     files = protocol.frozen()["files"]
-    for name in ("env.py", "mechanics/health.py", "families/hazard_nav.py", "evaluation/failures.py"):
+    for name in (
+        "env.py",
+        "engine.py",
+        "mechanics/hazards.py",
+        "families/hazard_nav.py",
+        "evaluation/failures.py",
+    ):
         assert f"hipg_bench/{name}" in files
     assert {"assets/walker.xml", "tasks/splits/shift.toml", "tasks/splits/walker.safetensors"} <= set(files)
     path = protocol.data_folder("assets") / "drone.xml"

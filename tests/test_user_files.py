@@ -83,6 +83,25 @@ def test_a_training_overwrites_no_file_of_others(tmp_path, theirs):
     assert everything(tmp_path / "own") == {theirs: b"mine"}
 
 
+@pytest.mark.parametrize("record", ["{}", '{"task": "hazard_nav-4"}', None])
+def test_a_training_does_not_believe_a_record_of_others(tmp_path, record):
+    """Nor one of another run, beside which somebody keeps files of the same names."""
+    out = tmp_path / "own"
+    if record is None:
+        train(recommended("hazard_nav-4", **TINY, seed=7), out, command="test")
+        (out / "checkpoint.pt").unlink()
+        (out / "curve.csv").unlink()
+    else:
+        write_text(out / "train.json", record)
+    (out / "policy.safetensors").write_text("mine")
+    (out / "replay").mkdir(exist_ok=True)
+    (out / "replay" / "mine.npy").write_text("mine")
+    before = everything(out)
+    with pytest.raises(ResumeError, match="choose another --out"):
+        train(recommended("hazard_nav-4", **TINY), out, command="test")
+    assert {name: everything(out).get(name) for name in before} == before
+
+
 def test_half_written_files_of_the_dead_are_removed(tmp_path):
     evaluate(tmp_path)
     for folder in (tmp_path, tmp_path / "episodes"):

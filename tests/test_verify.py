@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import time
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
@@ -17,15 +19,16 @@ from safetensors.numpy import load_file, save_file
 from hipg_bench.errors import BoardError, BundleError, ResumeError, SpecError
 from hipg_bench.evaluation import machines, protocol, runner
 from hipg_bench.leaderboard import adding
+from hipg_bench.leaderboard import verify as verifying
 from hipg_bench.leaderboard.board import Board
-from hipg_bench.leaderboard.entry_view import read_board
+from hipg_bench.leaderboard.entry_view import EntryView, read_board
 from hipg_bench.leaderboard.playing import BoardEvaluation
 from hipg_bench.leaderboard.rows import pack, parse_rows, unpack
 from hipg_bench.leaderboard.salt import new_salt, read_salt, reveal_salt
 from hipg_bench.leaderboard.source import opened
 from hipg_bench.leaderboard.verify import verify
 from hipg_bench.paths import data_folder
-from hipg_bench.policies.bundle import load_agent
+from hipg_bench.policies.bundle import Agent, load_agent
 from hipg_bench.sandbox import choice
 from hipg_bench.submissions import archive
 
@@ -257,8 +260,107 @@ def test_code_that_ignores_its_training_seed_was_trained_once(tmp_path):
     folder = python(tmp_path / "one", "one", "np.tanh(observation[..., :3])")
     card = (folder / "agent.toml").read_text().replace("= [0]", "= [0, 1]")
     (folder / "agent.toml").write_text(card)
-    with pytest.raises(BundleError, match="training seeds 0 and 1 played alike in all 3 worlds"):
+    with pytest.raises(BundleError, match="training seeds 0 and 1 played alike in the 3 worlds"):
         add(Board(tmp_path / "board"), folder, SHORT)
+
+
+@pytest.mark.parametrize("seed_of_copy", [1, 2])
+def test_near_copies_of_one_training_are_not_several(tmp_path, seed_of_copy):
+    """A weight that is moved a little makes no training of its own."""
+    folder = network(tmp_path / "near", "near")
+    first = folder / TASK / "seed0.safetensors"
+    with safe_open(first, "numpy") as file:
+        metadata = file.metadata()
+    tensors = load_file(first)
+    name = sorted(tensors)[0]
+    tensors[name] = tensors[name] + np.float32(seed_of_copy * 2.0**-15)
+    save_file(tensors, folder / TASK / f"seed{seed_of_copy}.safetensors", metadata)
+    with pytest.raises(
+        BundleError, match=f"training seeds 0 and {seed_of_copy} played alike in the 3 worlds"
+    ):
+        add(Board(tmp_path / "board"), folder, SHORT)
+
+
+def outcomes(claims, folder, returns):
+    """Rows of training seeds with given returns, None for an episode that failed."""
+    row = json.loads((claims / "standard/episodes" / f"{TASK}.jsonl").read_text().splitlines()[0])
+    lines = [
+        row | {"train_seed": seed, "world": world, "episode_id": world}
+        | ({"status": "not_finite"} if value is None else {"return": value})
+        for seed, values in enumerate(returns) for world, value in enumerate(values)
+    ]  # fmt: skip
+    (folder / "episodes").mkdir()
+    (folder / "episodes" / f"{TASK}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("returns", "alike"),
+    [
+        ([[1.0, 2.0, 3.0], [1.0, 2.0, None]], True),  # it failed in one world on purpose
+        ([[1.0, 2.0, 3.0], [1.0001, 2.0001, 9.0]], True),  # and played otherwise in one
+        ([[5.0, 5.0, 5.0], [5.0, 5.0, 5.0]], True),
+        ([[1.0, 2.0, 3.0], [1.1, 2.1, 3.1]], False),
+        ([[5.0, 5.0, 5.0], [5.1, 5.1, 5.1]], False),
+        ([[1.0, None, None], [None, 1.0, None]], False),  # nothing to compare
+    ],
+)
+def test_what_is_alike(tmp_path, rows, returns, alike):
+    run = outcomes(rows, tmp_path, returns)
+    if alike:
+        with pytest.raises(BundleError, match="played alike"):
+            adding._refuse_alike(run)
+    else:
+        adding._refuse_alike(run)
+
+
+@pytest.mark.parametrize("kind", ["another task", "unplayed task", "pipe", "device"])
+def test_claims_of_other_tasks_or_of_no_files_are_refused(tmp_path, salted, rows, kind):
+    shutil.copytree(rows, tmp_path / "claims")
+    episodes = tmp_path / "claims" / "standard" / "episodes"
+    real = episodes / f"{TASK}.jsonl"
+    match, said = EVALUATION, "does not play here"
+    if kind == "another task":
+        shutil.copyfile(real, episodes / "coop_nav-3.jsonl")
+    elif kind == "unplayed task":
+        shutil.copyfile(real, episodes / "coop_nav-3.jsonl")
+        match = BoardEvaluation((TASK, "coop_nav-3"), EVALUATION.splits, episodes=6, threads=1)
+    else:
+        real.unlink()
+        os.mkfifo(real) if kind == "pipe" else real.symlink_to("/dev/zero")
+        said = "links, pipes and devices are not allowed"
+    board = Board(tmp_path / "board")
+    with pytest.raises(BoardError, match=said):
+        add(board, salted[2], match, claims=tmp_path / "claims")
+    assert board.names() == ()
+
+
+@pytest.mark.parametrize("path", ["standard/episodes/coop_nav-3.jsonl.gz", f"shift/episodes/{TASK}.jsonl.gz"])
+def test_rows_that_nobody_plays_again_are_no_verified_ones(board, salted, tmp_path, path):
+    """However a file came into an entry, it counts."""
+    folder = board.folder("newcomer")
+    entry = json.loads((folder / "entry.json").read_text())
+    text = unpack(folder / f"standard/episodes/{TASK}.jsonl.gz")
+    entry["rows"][path] = pack(text, folder / path)
+    (folder / "entry.json").write_text(json.dumps(entry))
+    found = verify(board, "newcomer", salted[1], tmp_path / "private", threads=1)
+    assert found.outcome == "mismatch"
+
+
+def test_revealing_goes_on_after_a_damaged_file(board, salted, tmp_path):
+    verify(board, "newcomer", salted[1], tmp_path / "private", threads=1)
+    (tmp_path / "salt").write_text(salted[1].hex() + "\n")
+    (tmp_path / "salt").chmod(0o600)
+    hidden = tmp_path / "private" / "newcomer" / "v1" / "hidden"
+    damaged = hidden / "forced_death" / "episodes" / f"{TASK}.jsonl.gz"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:50])
+    first = reveal_salt(board.root, tmp_path / "salt")
+    wrong = f"newcomer: hidden/forced_death/episodes/{TASK}.jsonl.gz"
+    assert board.publish_rows(tmp_path / "private") == (1, [wrong])
+    damaged.write_bytes(whole)
+    assert reveal_salt(board.root, tmp_path / "salt") == first
+    assert board.publish_rows(tmp_path / "private") == (2, [])
 
 
 def a_billionth(row):
@@ -354,6 +456,36 @@ def test_code_of_others_is_verified_in_the_sandbox_and_sharing_is_listed(tmp_pat
         found = verify(board, folder.name, salt, tmp_path / "private", threads=1)
         assert (found.outcome, found.sandbox, found.execution) == ("verified", choice.sandbox(), execution)
     assert any("acted on more than they observed" in reason for reason in found.reasons)
+
+
+class SharesAfterADeath:
+    """Every agent acts on its own observation until a team-mate is dead, and then on another's."""
+
+    privileged = False
+
+    def initial_state(self, seed, episode_id, num_agents):
+        return None
+
+    def act(self, seen, memory, alive):
+        shared = np.where(alive.all(axis=1)[:, None, None], seen, np.roll(seen, 1, axis=1))
+        return 0.1 * np.tanh(shared[..., :3]), None
+
+
+@pytest.mark.parametrize(
+    ("splits", "execution"),
+    [(("standard",), "decentralised"), (("standard", "forced_death"), "centralised")],
+)
+def test_sharing_is_found_in_every_split_that_counts(splits, execution):
+    """Nobody dies on this task unless the split kills."""
+    task = "coop_nav-3"
+    played = {"tasks": [{"task": task}], "skipped": [], "episodes_per_policy": 6}
+    view = Mock(spec=EntryView, results={("public", split): played for split in splits})
+    view.entry = Mock(privileged=False, policies={task: {0: ""}})
+    agent = Mock(spec=Agent, policy=lambda spec, seed: SharesAfterADeath())
+    agent.card = Mock(execution="decentralised", tier=2)
+    found, said = verifying._audit(agent, view, bytes(32), "key")
+    assert found == execution
+    assert all(reason.startswith("forced_death, coop_nav-3, training seed 0: centralised") for reason in said)
 
 
 def test_trusted_code_is_never_verified(tmp_path, board, salted):

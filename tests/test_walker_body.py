@@ -5,11 +5,17 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from walkers import PLANAR, ROW, SPATIAL, lowest_corner, put, root, snapshot, world
+from walkers import PLANAR, ROW, SPATIAL, lowest_corner, put, read, root, world
 
 from hipg_bench import make
 
 BOTH = pytest.mark.parametrize("task", [SPATIAL, PLANAR])
+
+
+def planks(env):
+    """Places (B, 3), m, and speeds (B, 3), m/s, of all planks."""
+    scratches = [read(env, k).scratch for k in range(env.num_envs)]
+    return np.array([one.place[-1] for one in scratches]), np.array([one.speed[-1] for one in scratches])
 
 
 @BOTH
@@ -23,30 +29,30 @@ def test_what_is_read_is_what_mujoco_derives(task: str):
         data.qvel = rng.normal(0, 1, env.model.nv)
         mujoco.mj_normalizeQuat(env.model, data.qpos)
         put(env, data, k)
-    now = snapshot(env)
+    joints = env.layout.state.view(env.arrange().info["state"], "joint")
     for k in range(20):
-        data = world(env, k)
+        data, now = world(env, k), read(env, k).scratch
         bodies = ["walker0/torso", "walker1/torso", "walker2/torso", "plank/plank"]
         for i, body in enumerate(bodies):
-            np.testing.assert_allclose(now.pose.position[k, i], data.body(body).xpos, atol=1e-12)
-            np.testing.assert_allclose(now.pose.rotation[k, i].ravel(), data.body(body).xmat, atol=1e-12)
+            np.testing.assert_allclose(now.place[i], data.body(body).xpos, atol=1e-12)
+            np.testing.assert_allclose(now.turn[i].ravel(), data.body(body).xmat, atol=1e-12)
             velocity = np.empty(6)
             kind, index = mujoco.mjtObj.mjOBJ_XBODY, env.model.body(body).id
             mujoco.mj_objectVelocity(env.model, data, kind, index, velocity, 1)
-            np.testing.assert_allclose(now.pose.spin[k, i], velocity[:3], atol=1e-12)
+            np.testing.assert_allclose(now.spin[i], velocity[:3], atol=1e-12)
             mujoco.mj_objectVelocity(env.model, data, kind, index, velocity, 0)
-            np.testing.assert_allclose(now.pose.velocity[k, i], velocity[3:], atol=1e-12)
+            np.testing.assert_allclose(now.speed[i], velocity[3:], atol=1e-12)
         for i in range(3):
             soles = [lowest_corner(data, f"walker{i}/{side}_foot") for side in ("left", "right")]
-            assert (now.touch[k, i] == (np.array(soles) < 0.002)).all()
+            assert (now.touch[i] == (np.array(soles) < 0.002)).all()
             joint = [
                 data.joint(f"walker{i}/{side}_{name}").qpos[0]
                 for side in ("left", "right")
                 for name in (("hip", "knee") if task == PLANAR else ("abduction", "hip", "knee", "ankle"))
             ]
-            assert now.pose.joint[k, i].ravel().tolist() == joint
+            np.testing.assert_array_equal(joints[k, i].ravel(), np.array(joint, np.float32))
         low = min(lowest_corner(data, f"plank/{name}") for name in ("board", "left_rail", "right_rail"))
-        assert now.plank_low[k] == pytest.approx(low, abs=1e-12)
+        assert now.plank_low == pytest.approx(low, abs=1e-12)
 
 
 @BOTH
@@ -57,9 +63,8 @@ def test_feet_that_carry_weight_touch(task: str):
     loaded = lifted = 0
     for _ in range(40):
         env.step(rng.uniform(-1, 1, (8, 3, env.action_size)))
-        now = snapshot(env)
         for k in range(8):
-            data = world(env, k)
+            data, now = world(env, k), read(env, k).scratch
             for i in range(3):
                 for leg, side in enumerate(("left", "right")):
                     name = f"walker{i}/{side}_foot"
@@ -67,8 +72,8 @@ def test_feet_that_carry_weight_touch(task: str):
                         env.model.geom(name).id in (contact.geom1, contact.geom2) for contact in data.contact
                     )
                     clear = lowest_corner(data, name) > 0.01
-                    assert not (touches and not now.touch[k, i, leg])
-                    assert not (clear and now.touch[k, i, leg])
+                    assert not (touches and not now.touch[i, leg])
+                    assert not (clear and now.touch[i, leg])
                     loaded += touches
                     lifted += clear
     assert loaded > 100
@@ -79,16 +84,17 @@ def test_feet_that_carry_weight_touch(task: str):
 def test_the_plank_rests_on_standing_walkers(task: str):
     env = make(task, 256, threads=1)
     env.reset()
-    start = snapshot(env).pose.position[:, -1].copy()
+    start = planks(env)[0]
     for _ in range(100):  # 2 s
         step = env.step(np.zeros((256, 3, env.action_size)))
         assert not step.terminated.any()
     assert step.info["alive"].all()
-    moved = snapshot(env).pose.position[:, -1] - start
+    place, speed = planks(env)
+    moved = place - start
     assert np.abs(moved[:, :2]).max() < 0.1
     # the heads give way under the weight and by the spread of the starts, no more
     assert np.abs(moved[:, 2]).max() < 0.05
-    assert np.linalg.norm(snapshot(env).pose.velocity[:, -1], axis=1).max() < 0.2
+    assert np.linalg.norm(speed, axis=1).max() < 0.2
 
 
 @pytest.mark.parametrize("task", [SPATIAL, PLANAR, "multiwalker-5"])
@@ -105,8 +111,8 @@ def test_fifty_steps_are_those_of_plain_mujoco(task: str):
         data.ctrl = action[1].ravel()
         for _ in range(env.decimation):
             mujoco.mj_step(env.model, data)
-        assert data.qpos.tobytes() == env._sim.position[1].tobytes()
-        assert data.qvel.tobytes() == env._sim.velocity[1].tobytes()
+        assert data.qpos.tobytes() == env.get_field("coordinate")[1].tobytes()
+        assert data.qvel.tobytes() == env.get_field("rate")[1].tobytes()
 
 
 @BOTH

@@ -13,7 +13,6 @@ from play import action, actions, flat, outcomes, play, same
 import hipg_bench
 from hipg_bench import BatchEnv, TaskSpec, make
 from hipg_bench.env import world_model
-from hipg_bench.registry import family_of
 
 TASKS = sorted(hipg_bench.tasks())
 KIND = mujoco.mjtObj
@@ -33,7 +32,7 @@ def env(request: pytest.FixtureRequest) -> BatchEnv:
 
 @pytest.fixture(scope="module")
 def visual(env: BatchEnv) -> mujoco.MjModel:
-    return world_model(env.spec, family_of(env.spec), visual=True)
+    return world_model(env.definition, visual=True)
 
 
 def own_actuators(env: BatchEnv, agent: int) -> np.ndarray:
@@ -49,7 +48,7 @@ def own_actuators(env: BatchEnv, agent: int) -> np.ndarray:
 
 def actuator_forces(env: BatchEnv, world: int, control: float | None = None) -> np.ndarray:
     """(nu,) forces on a plain MjData loaded with the world, its disable mask included."""
-    model, data = env._sim.batch.get_model(world), env._sim.batch.get_data(world)
+    model, data = env._stepper.sim.batch.get_model(world), env._stepper.sim.batch.get_data(world)
     if control is not None:
         data.ctrl[:] = control
     mujoco.mj_forward(model, data)
@@ -126,22 +125,34 @@ def test_saved_rows_go_on_bit_for_bit(env: BatchEnv):
 
 
 def test_a_reset_leaves_what_the_engines_own_reset_leaves(env: BatchEnv):
-    sim, ids = env._sim, np.array([2, 0])
+    stepper, ids = env._stepper, np.array([2, 0])
+    sim, clean = stepper.sim, make(env.spec, 4, threads=1)
     play(env, env.reset(), 2)
-    sim.position[0] = np.nan
-    assert sim.advance().tolist() == [True, False, False, False]
+    place = clean.definition.family.PHYSICS["QPOS"][0]
+    stepper.worlds[place][0] = np.nan
+    sim.advance()
     others = sim.rows[[1, 3]].copy()
-    sim.reset(ids)
+    env.reset(np.array([7, 8]), worlds=ids)
     ours = sim.rows[ids].copy()
-    # counts begin at 1, so that MuJoCo prints nothing, for what is no number; else at 0
-    counts = sim.batch.warning[ids, :, 1]
-    kind = mujoco.mjtWarning
-    odd = [int(kind.mjWARN_BADQPOS), int(kind.mjWARN_BADQVEL), int(kind.mjWARN_BADQACC)]
-    assert (counts[:, odd] == 1).all()
-    assert counts.sum() == counts[:, odd].sum()
+    # counts begin at 1, so that MuJoCo prints nothing and writes no file
+    assert (sim.batch.warning[ids, :, 1] == 1).all()
     assert same(sim.rows[[1, 3]], others)
-    sim.batch.reset(np.sort(ids), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
-    assert same(sim.rows[ids], ours)
+    # where an episode begins afresh, and where MuJoCo itself put the world before
+    assert same(clean.reset(np.array([7, 8, 9, 10])).observation[:2], env.arrange().observation[ids])
+    assert same(clean.rows[:2], ours)
+
+
+def spoil(env: BatchEnv, world: int, value: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the next step's physics of a world begin with a velocity that no physics can go on from."""
+    stepper = env._stepper
+    advance, name = stepper.sim.advance, env.definition.family.PHYSICS["QVEL"][0]
+
+    def once() -> None:
+        stepper.worlds[name][world] = value
+        monkeypatch.setattr(stepper.sim, "advance", advance)
+        advance()
+
+    monkeypatch.setattr(stepper.sim, "advance", once)
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e30], ids=["nan", "huge"])
@@ -155,7 +166,7 @@ def test_divergence_ends_only_its_own_episode(
         was, was_calm = disturbed, calm
         command = np.stack([action(env, b, t) for b in range(4)])
         if t == 6:
-            broken._sim.velocity[2] = value
+            spoil(broken, 2, value, monkeypatch)
         calm, disturbed = env.step(command), broken.step(command)
         for name, array in flat(disturbed).items():
             if array.dtype.kind == "f" and "metrics" not in name:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from one_world import OneWorld
 
 from hipg_bench import BatchEnv
-from hipg_bench.families.multiwalker import MultiWalker, Snapshot
 
 ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 SPATIAL, PLANAR = "multiwalker-3", "multiwalker_planar-3"
@@ -38,10 +38,12 @@ def turn(axis: tuple[float, float, float], angle: float) -> np.ndarray:
     return quaternion
 
 
-def snapshot(env: BatchEnv) -> Snapshot:
-    family = env.family
-    assert isinstance(family, MultiWalker)
-    return family.read(env._sim)
+def read(env: BatchEnv, k: int = 0) -> OneWorld:
+    """World k, with all bodies and feet read."""
+    one = OneWorld(env, k)
+    one.read()
+    one.call("survey", one.w, one.scratch, one.task)
+    return one
 
 
 def lowest_corner(data: mujoco.MjData, geom: str) -> float:

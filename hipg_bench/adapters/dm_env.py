@@ -119,7 +119,7 @@ class HipgEnvironment(dm_env.Environment):
     def observation_spec(self) -> Any:
         """Named arrays, as the task's layout has them."""
         lead = (self.spec.num_agents,) if self._joint else ()
-        blocks = self._env.layout.observation.blocks
+        blocks = self._env.layout.observation.present
         return self._per_agent({b.name: specs.Array((*lead, *b.shape), np.float32, b.name) for b in blocks})
 
     def action_spec(self) -> Any:
@@ -163,6 +163,6 @@ class HipgEnvironment(dm_env.Environment):
 
     def _observation(self, step: Step) -> Any:
         layout, flat = self._env.layout.observation, step.observation[0]
-        arrays = {block.name: layout.view(flat, block.name) for block in layout.blocks}
+        arrays = {block.name: layout.view(flat, block.name) for block in layout.present}
         agents = range(self.spec.num_agents)
         return arrays if self._joint else [{name: a[i] for name, a in arrays.items()} for i in agents]

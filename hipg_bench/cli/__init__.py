@@ -31,6 +31,7 @@ from hipg_bench.cli import (
     figures,
     leaderboard,
     media,
+    reproduce,
     rollout,
     settings,
     submit,
@@ -91,6 +92,7 @@ app.command()(evaluate.evaluate)
 app.command()(compare.compare)
 app.command()(export.export)
 app.command()(train.train)
+app.command()(reproduce.reproduce)
 app.command()(settings.settings)
 app.command()(collect.collect)
 app.command()(figures.figures)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import quoted
 
 app = typer.Typer(help="List the bundled agents, or show one.", no_args_is_help=False)
 
@@ -50,7 +51,7 @@ def show(
     if not facts["tasks"]:
         console.say("it has no policies yet")
         return
-    rows = console.table("\ntask", "\ntraining seeds", "\npolicy", "\ntrained by")
+    rows = console.table("\ntask", "\ntraining seeds", "\npolicy", "\ntrained again by")
     for task in facts["tasks"]:
         seeds = ", ".join(str(seed) for seed in task["train_seeds"])
         rows.add_row(task["task"], seeds, task["fingerprints"][0], task["command"])
@@ -64,7 +65,7 @@ def _facts(agent: Any) -> dict[str, Any]:
             "task": task,
             "train_seeds": list(seeds),
             "fingerprints": [agent.fingerprint(task, seed) for seed in seeds],
-            "command": _command(agent.folder / task / f"seed{seeds[0]}.json"),
+            "command": _command(agent, task, seeds[0]),
         }
         for task in agent.tasks
         if (seeds := agent.train_seeds(task))
@@ -72,8 +73,11 @@ def _facts(agent: Any) -> dict[str, Any]:
     return agent.card.model_dump(mode="json") | {"folder": str(agent.folder), "tasks": tasks}
 
 
-def _command(path: Any) -> str:
-    """The command that trained a policy, where the bundle tells it."""
-    from hipg_bench.documents import read_json
+def _command(agent: Any, task: str, seed: int) -> str:
+    """The command that trains a policy again, where the bundle has the record of its training."""
+    if not (agent.folder / task / f"seed{seed}.json").is_file():
+        return ""
+    from hipg_bench.policies.bundle import agents
 
-    return str(read_json(path).get("command", "")) if path.is_file() else ""
+    name = agent.name if agent.name in agents() else quoted(agent.folder)
+    return f"hipg-bench reproduce {name} {task} {seed}"

@@ -46,6 +46,9 @@ TaskOption = Annotated[
 TaskArgument = Annotated[
     str, typer.Argument(help="A task's name or a task file (.toml).", autocompletion=complete_task)
 ]
+AgentArgument = Annotated[
+    str, typer.Argument(help="A bundled agent's name or a bundle's folder.", autocompletion=_complete_agent)
+]
 NumAgentsOption = Annotated[
     int | None, typer.Option(min=2, max=31, help="Number of agents, if it differs from the task's.")
 ]

@@ -53,7 +53,7 @@ def show(
     from hipg_bench import registry
 
     spec = task_of(task, num_agents, setting)
-    layout = registry.family_of(spec).layout
+    layout = registry.definition_of(spec).layout
     vectors = {"observation": layout.observation, "action": layout.action, "state": layout.state}
     if as_json:
         blocks = {name: _blocks(vector) for name, vector in vectors.items()}
@@ -114,7 +114,7 @@ def _blocks(vector: Layout) -> list[dict[str, Any]]:
             "frame": block.frame,
             "visible": block.visible,
         }
-        for block in vector.blocks
+        for block in vector.present
     ]
 
 

@@ -152,7 +152,7 @@ def train(
         *(f"--set {quoted(pair)}" for pair in setting or []),
     ]
     command = " ".join(["hipg-bench train", *options, f"--steps {settings.steps}", f"--out {quoted(folder)}"])
-    _train_one(settings, folder, command, tuple(track or ()))
+    train_one(settings, folder, command, tuple(track or ()))
 
 
 def _algorithm(algorithm: str | None, credit: str | None, given: dict[str, Any]) -> str:
@@ -184,7 +184,8 @@ def _task(task: str, num_agents: int | None, pairs: list[str], settings: Collect
     return task_of(task, num_agents, pairs)
 
 
-def _train_one(settings: AnySettings, out: Path, command: str, track: tuple[str, ...]) -> None:
+def train_one(settings: AnySettings, out: Path, command: str, track: tuple[str, ...] = ()) -> None:
+    """Train one run with a progress display, and print what came of it."""
     from hipg_bench.learning.run import train as run
 
     if _is_finished(settings, out):

@@ -38,6 +38,9 @@ BUNDLES = {
     "min_health": "mappo_minhealth",
     "central": "mappo_central",
     "local": "mappo_local",
+    "ma_poca": "ma_poca",
+    "coma": "coma",
+    "difference_rewards": "difference_rewards",
     "maddpg": "maddpg",
     "qmix": "qmix",
 }
@@ -61,8 +64,16 @@ class Collected:
 
 
 def bundle_name(algorithm: str) -> str:
-    """The bundle of an algorithm, perhaps with a label: ``central-masked`` is in ``mappo_central_masked``."""
+    """The bundle of an algorithm, perhaps with a label: ``central-masked`` is in ``mappo_central_masked``.
+
+    Raises:
+        BundleError: a credit rule from outside, for which there is no bundle.
+    """
     plain, _, label = algorithm.partition("-")
+    if plain not in BUNDLES:
+        raise BundleError(
+            f"runs of own credit rules ({plain}) are not collected: there are {', '.join(BUNDLES)}"
+        )
     return BUNDLES[plain] + (f"_{label}" if label else "")
 
 

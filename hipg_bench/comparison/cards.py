@@ -16,6 +16,9 @@ _SUMMARIES = {
     "lose without it",
     "central": "MAPPO with a central critic: all live agents share the team's advantage",
     "local": "MAPPO with a local critic: each agent's advantage is estimated from its own observation",
+    "ma_poca": "MA-POCA: attention over the living; each agent's baseline leaves out its own action",
+    "coma": "COMA for continuous actions: the value of an agent's action over its policy's mean",
+    "difference_rewards": "MAPPO with difference rewards: the team's reward less that without the agent",
     "maddpg": "MADDPG: an actor and a central critic for every agent, learned from replayed steps",
     "qmix": "QMIX: values of discretised actions, mixed monotonically, learned from replayed steps",
 }

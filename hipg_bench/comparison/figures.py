@@ -43,6 +43,9 @@ _ALGORITHMS: dict[str, tuple[str, str, str]] = {
     "min_health": ("min-health", "#0072B2", "o"),
     "central": ("central", "#E69F00", "X"),
     "local": ("local", "#009E73", "^"),
+    "ma_poca": ("MA-POCA", "#56B4E9", "v"),
+    "coma": ("COMA", "#999933", "<"),
+    "difference_rewards": ("difference rewards", "#332288", ">"),
     "maddpg": ("MADDPG", "#D55E00", "P"),
     "qmix": ("QMIX", "#AA4499", "D"),
 }

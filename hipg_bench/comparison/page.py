@@ -81,11 +81,13 @@ def task_table(judged: Sequence[Judged]) -> str:
 
 def score_table(runs: Sequence[Trace]) -> str:
     """Interquartile mean, worst and best of what the runs of every algorithm reached."""
-    lines = ["| task | " + " | ".join(BUNDLES) + " |", "|---" * (1 + len(BUNDLES)) + "|"]
+    trained = {run.algorithm for run in runs}
+    columns = [algorithm for algorithm in BUNDLES if algorithm in trained]
+    lines = ["| task | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in TASKS:
         cells = [
             _cell([run.final for run in runs if (run.task, run.algorithm) == (task, algorithm)])
-            for algorithm in BUNDLES
+            for algorithm in columns
         ]
         lines.append(f"| {task} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

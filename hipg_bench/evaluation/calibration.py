@@ -69,7 +69,7 @@ def calibrate(spec: TaskSpec, episodes: int, *, threads: int = 0, progress: Prog
         UnknownNameError: its family has neither a scripted expert nor a stated reference.
     """
     lab = _Lab(spec, EvaluationJob(_SEED, episodes, threads=threads), progress)
-    size = registry.family_of(spec).layout.action.size
+    size = registry.definition_of(spec).layout.action.size
     random = lab.play("random", Random(size))
     reference, reference_is = _stated(spec) or (
         _anchor(lab.play("scripted", Scripted(spec))), "scripted expert with the joint state",
@@ -107,7 +107,7 @@ def anchors_in(split: str, spec: TaskSpec, episodes: int, *, threads: int = 0, p
         UnknownNameError: no such split, or it has no rules for the task's family.
     """
     job = EvaluationJob(_SEED, episodes, threads=threads, split=split)
-    size = registry.family_of(spec).layout.action.size
+    size = registry.definition_of(spec).layout.action.size
     random = job.play_all(spec, Random(size), lambda done: progress("random", done))
     stated = _stated(spec)
     if stated:

@@ -30,7 +30,7 @@ from hipg_bench.evaluation.failures import (
 from hipg_bench.evaluation.seeds import FIRST_SEED, WORLDS_PER_SEED, hidden_seed
 from hipg_bench.evaluation.worlds import FORCED, Worlds
 from hipg_bench.policies.policy import Policy
-from hipg_bench.registry import family_of
+from hipg_bench.registry import definition_of
 from hipg_bench.spec import TaskSpec
 
 _COMMON = ("return", "length", "survival", "deaths", "first_death")
@@ -161,7 +161,7 @@ class EvaluationJob:
                 states.append(worlds.env.rows)
         finally:
             close(policy)
-        again = float(worlds.env.recall(states[-1], "return")[0, 0])
+        again = float(worlds.env.get_field("episode_return", states[-1])[0])
         if again != row["reached"]:
             raise HipgError(
                 f"{spec.task}: world {row['world']} returned {row['reached']!r}, played again {again!r}; "
@@ -243,7 +243,7 @@ class EvaluationJob:
             "first_death": None,
             "death_list": [],
             "others": [],
-            "metrics": dict.fromkeys(family_of(spec).metrics),
+            "metrics": dict.fromkeys(definition_of(spec).metrics),
         }
 
 

@@ -12,7 +12,7 @@ from hipg_bench.evaluation import splits
 from hipg_bench.evaluation.episodes import Row
 from hipg_bench.evaluation.failures import NOT_PLAYED
 from hipg_bench.evaluation.seeds import WORLDS_PER_SEED
-from hipg_bench.registry import family_of
+from hipg_bench.registry import definition_of
 from hipg_bench.spec import Params, TaskSpec, parse
 
 _MOST = 2**53
@@ -107,7 +107,7 @@ def _refuse(constant: str) -> Any:
 
 def _check_agreement(row: Row, where: str, spec: TaskSpec) -> None:
     """Refuse fields that contradict each other or the task."""
-    bodies, steps, metrics = spec.num_agents, spec.horizon, sorted(family_of(spec).metrics)
+    bodies, steps, metrics = spec.num_agents, spec.horizon, sorted(definition_of(spec).metrics)
     agents = [death["agent"] for death in row["death_list"]]
     wrong = {
         f"task = {row['task']!r} in a file of {spec.task}": row["task"] != spec.task,

@@ -8,10 +8,10 @@ anchors measured under them in ``tasks/splits/anchors.toml``, by task.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -22,7 +22,7 @@ from hipg_bench import registry
 from hipg_bench.documents import read_toml
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import BundleError, UnknownNameError, hint
-from hipg_bench.families.family import Family
+from hipg_bench.families import known
 from hipg_bench.paths import data_folder
 from hipg_bench.policies.network import load_network
 from hipg_bench.policies.policy import Policy
@@ -49,6 +49,13 @@ class Shift(Params):
     params: Mapping[str, float] = pydantic.Field(default={})
     friction: float = pydantic.Field(default=1.0, gt=0, le=4)
     strength: float = pydantic.Field(default=1.0, gt=0, le=4)
+
+    def change(self, scene: mujoco.MjSpec) -> None:
+        """Change a composed world's friction and strength."""
+        for geom in scene.geoms:
+            geom.friction[0] *= self.friction
+        for actuator in scene.actuators:
+            actuator.forcerange = np.asarray(actuator.forcerange) * self.strength
 
 
 class SplitConfig(Params):
@@ -85,9 +92,9 @@ class SplitConfig(Params):
         variant = self.variant(block)
         if variant is None:
             return registry.make(spec, num_envs, seed, threads=threads)
-        changed = self.spec(spec, block)
-        family = cast(Family, _Reshaped(registry.family_of(changed), self.shifts[variant]))
-        return BatchEnv(changed, family, num_envs, seed, threads=threads)
+        changed = registry.definition_of(self.spec(spec, block))
+        definition = dataclasses.replace(changed, change_scene=self.shifts[variant].change)
+        return BatchEnv(definition, num_envs, seed, threads=threads)
 
     def death_schedule(self, seed: int, ids: Int[np.ndarray, "B"], spec: TaskSpec) -> Int[np.ndarray, "B N"]:
         """Control step at whose end each agent is killed; -1 for those who are spared."""
@@ -121,7 +128,7 @@ class SplitConfig(Params):
             return None
         if self.background == _BLIND:
             return Scripted(spec, blind=True)
-        network, layout = load_network(folder() / self.background), registry.family_of(spec).layout
+        network, layout = load_network(folder() / self.background), registry.definition_of(spec).layout
         if (network.observation_size, network.action_size) != (layout.observation.size, layout.action.size):
             raise BundleError(f"{spec.task}: {self.background} is made for other bodies")
         return network
@@ -137,10 +144,14 @@ def split_config(split: str, spec: TaskSpec) -> SplitConfig:
         raise UnknownNameError(f"no split {split!r}{hint(split, SPLITS)}")
     if split == STANDARD:
         return SplitConfig()
-    families = _rules(split)
-    if spec.family not in families:
+    families, lineage = _rules(split), known.lineage(spec.family)
+    own = (known.declared(spec.family, "SPLITS") or {}).get(split)
+    if own is not None:
+        return parse(SplitConfig, own, f"family {spec.family!r}: SPLITS: {split}")
+    name = next((name for name in lineage if name in families), None)
+    if name is None:
         raise UnknownNameError(f"{spec.task}: {split} has no rules for its family, {spec.family!r}")
-    return families[spec.family]
+    return families[name]
 
 
 def with_anchors(split: str, spec: TaskSpec) -> TaskSpec:
@@ -183,25 +194,3 @@ def _chances(seed: int, purpose: int, ids: Int[np.ndarray, "B"]) -> list[np.rand
         np.random.Generator(np.random.Philox(key=[seed, purpose], counter=[0, 0, 0, episode]))
         for episode in ids.tolist()
     ]
-
-
-class _Reshaped:
-    """A family whose scene has another friction and strength; all else is the family's."""
-
-    def __init__(self, family: Family, shift: Shift) -> None:
-        self._family = family
-        self._shift = shift
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what pickle and deepcopy ask for before there is a family
-            raise AttributeError(name)
-        return getattr(self.__dict__["_family"], name)
-
-    def scene(self) -> mujoco.MjSpec:
-        """Compose the world, then change it."""
-        scene = self._family.scene()
-        for geom in scene.geoms:
-            geom.friction[0] *= self._shift.friction
-        for actuator in scene.actuators:
-            actuator.forcerange = np.asarray(actuator.forcerange) * self._shift.strength
-        return scene

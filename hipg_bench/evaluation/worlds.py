@@ -85,13 +85,13 @@ class Worlds:
 
     def deaths(self, last: Float[np.ndarray, "R"]) -> list[Death]:
         """Who died in an episode, in the order of death, read off its last state row."""
-        died_at = self.env.recall(last[None], "death_time")[0]
-        cause = self.env.recall(last[None], "death_cause")[0]
+        died_at = self.env.get_field("death_time", last[None])[0]
+        cause = self.env.get_field("death_cause", last[None])[0]
         order = sorted(np.flatnonzero(died_at != NEVER).tolist(), key=lambda i: (died_at[i], i))
         return [Death(i, seconds(float(died_at[i]), self.env.spec), self._name(cause[i])) for i in order]
 
     def _name(self, cause: float) -> str:
-        return FORCED if cause == _FORCED_CAUSE else self.env.family.causes[int(cause)]
+        return FORCED if cause == _FORCED_CAUSE else self.env.definition.causes[int(cause)]
 
     def _apply_forced_deaths(self, step: Step) -> Step:
         """Kill those whose time has come: after a step, before anybody acts on what came of it."""
@@ -103,8 +103,10 @@ class Worlds:
         rows = self.env.rows[struck]
         for k, b in enumerate(struck.tolist()):
             victims = np.flatnonzero(due[b])
-            rows[k] = self.env.fork(rows[k : k + 1], dict.fromkeys(victims.tolist(), 0.0))[0]
-            self.env.recall(rows[k : k + 1], "death_cause")[0, victims] = _FORCED_CAUSE
+            forked = self.env.fork(rows[k : k + 1], dict.fromkeys(victims.tolist(), 0.0))
+            cause = self.env.get_field("death_cause", forked)
+            cause[0, victims] = _FORCED_CAUSE
+            rows[k] = self.env.set_field(forked, "death_cause", cause)[0]
         now = self.env.load_rows(struck, rows)
         present = {name: now.info[name] for name in ("state", "health", "alive")}
         return dataclasses.replace(step, observation=now.observation, info=step.info | present)

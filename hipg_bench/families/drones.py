@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from typing import Any
 
 import mujoco
 import numpy as np
 import pydantic
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from hipg_bench.families.family import EVERY, Rows
+from hipg_bench.families import family
 from hipg_bench.families.scene import asset, attach
 from hipg_bench.layout import SHARE, Block, Layout
-from hipg_bench.mechanics import coverage
-from hipg_bench.sim import Sim
+from hipg_bench.mechanics.geometry import distance3
 from hipg_bench.spec import Params, TaskSpec
 
 _PHYSICS_STEP = 0.02
 """Seconds per physics step."""
-
-_COLUMNS = 32
-"""Columns of an observation that are turned together, from worlds last to worlds first."""
 
 ACTION = Layout((Block("thrust", (3,), "of full thrust", "world"),))
 
@@ -45,6 +42,85 @@ class DroneParams(Params):
     drag: float = pydantic.Field(gt=0, le=100)
     sensing_radius: float = pydantic.Field(gt=0, le=20)
     neighbors: int = pydantic.Field(ge=1, le=30)
+
+
+class World(family.World):
+    """What every world with drones has."""
+
+    position: Float[np.ndarray, "N 3"]  # m
+    velocity: Float[np.ndarray, "N 3"]  # m/s
+    control: Float[np.ndarray, "N 3"]  # of full thrust
+
+
+class Scratch(family.Scratch):
+    """What a step works out of where drones are."""
+
+    apart: Float[np.ndarray, "N N"]  # drone to drone, infinite to oneself, m
+    order: Int[np.ndarray, "most"]  # of drones or points, nearest first
+    away: Float[np.ndarray, "most"]  # m
+
+
+class Numbers(family.Numbers):
+    """Numbers of drones; see `DroneParams`."""
+
+    half_width: float
+    ceiling: float
+    drone_radius: float
+    sensing_radius: float
+
+
+# --- rules ---------------------------------------------------------------------------------------------
+
+
+def act(
+    w: World, previous: family.Previous, scratch: Scratch, task: Numbers, command: Float[np.ndarray, "N 3"]
+) -> None:
+    """Thrust along the world's axes."""
+    for i in range(len(w.health)):
+        for axis in range(3):
+            w.control[i, axis] = command[i, axis]
+
+
+def find_neighbors(w: World, scratch: Scratch) -> None:
+    """Work out how far drones are from each other."""
+    position, apart = w.position, scratch.apart
+    for i in range(len(position)):
+        apart[i, i] = math.inf
+        for j in range(i):
+            apart[i, j] = apart[j, i] = distance3(position[j], position[i])
+
+
+def observe_self(w: World, i: int, seen: Any) -> None:
+    """Write a drone's own health, velocity and position."""
+    seen.health[0] = w.health[i]
+    for axis in range(3):
+        seen.velocity[axis], seen.position[axis] = w.velocity[i, axis], w.position[i, axis]
+
+
+def clear_neighbor(seen: Any, slot: int) -> None:
+    """Empty a neighbour's slot."""
+    seen.neighbor_seen[slot], seen.neighbor_health[slot] = 0.0, 0.0
+    for axis in range(3):
+        seen.neighbor_position[slot, axis], seen.neighbor_velocity[slot, axis] = 0.0, 0.0
+
+
+def observe_neighbor(w: World, i: int, j: int, seen: Any, slot: int) -> None:
+    """Write drone j into a neighbour's slot of drone i."""
+    seen.neighbor_seen[slot], seen.neighbor_health[slot] = 1.0, w.health[j]
+    for axis in range(3):
+        seen.neighbor_position[slot, axis] = w.position[j, axis] - w.position[i, axis]
+        seen.neighbor_velocity[slot, axis] = w.velocity[j, axis] - w.velocity[i, axis]
+
+
+def describe(w: World, state: Any) -> None:
+    """Write all drones into the joint state."""
+    for i in range(len(w.health)):
+        state.health[i] = w.health[i]
+        for axis in range(3):
+            state.position[i, axis], state.velocity[i, axis] = w.position[i, axis], w.velocity[i, axis]
+
+
+# --- declarations --------------------------------------------------------------------------------------
 
 
 def physics_steps(spec: TaskSpec) -> int:
@@ -77,44 +153,8 @@ def drone_scene(spec: TaskSpec, params: DroneParams) -> mujoco.MjSpec:
     return scene
 
 
-def place(sim: Sim, ids: Int[np.ndarray, "n"], position: Float[np.ndarray, "n N 3"]) -> None:
-    """Put drones at rest at the given places, m."""
-    sim.position[ids] = position.reshape(len(ids), -1)
-
-
-def kinematics(
-    sim: Sim, num_agents: int, rows: Rows = EVERY
-) -> tuple[Float[np.ndarray, "3 N n"], Float[np.ndarray, "3 N n"]]:
-    """Copies of the drones' positions (m) and velocities (m/s), worlds last."""
-    position = sim.position[rows].reshape(-1, num_agents, 3)
-    velocity = sim.velocity[rows].reshape(-1, num_agents, 3)
-    return position.T.copy(), velocity.T.copy()
-
-
-def living(health: Float[np.ndarray, "n N"]) -> Bool[np.ndarray, "N n"]:
-    """Who lives, worlds last."""
-    return health.T.copy() > 0
-
-
-def replace(now: object, ids: Int[np.ndarray, "n"], fresh: object) -> None:
-    """Replace some worlds of a snapshot, in which all arrays but health have the worlds last."""
-    for name, array in vars(now).items():
-        if isinstance(array, np.ndarray) and hasattr(fresh, name):
-            array[ids if name == "health" else (..., ids)] = getattr(fresh, name)
-
-
-def spread(
-    chance: Float[np.ndarray, "n C P 3"], low: tuple[float, float, float], high: tuple[float, float, float]
-) -> Float[np.ndarray, "n P 3"]:
-    """Of C candidate placements in a box, the one whose nearest pair is farthest apart."""
-    place = np.asarray(low) + chance * (np.asarray(high) - np.asarray(low))
-    n, c, p, _ = place.shape
-    gap = coverage.apart(place.reshape(n * c, p, 3).T).min(axis=(0, 1)).reshape(n, c)
-    return place[np.arange(n), gap.argmax(axis=1)]
-
-
 def neighbor_blocks(slots: int, visible: str) -> tuple[Block, ...]:
-    """Observation blocks filled by `sensing.write_team`."""
+    """Observation blocks of the nearest other drones."""
     return (
         Block("neighbor_seen", (slots,), "1", "-", visible, limits=SHARE),
         Block("neighbor_health", (slots,), "1", "-", visible, limits=SHARE),
@@ -123,29 +163,6 @@ def neighbor_blocks(slots: int, visible: str) -> tuple[Block, ...]:
     )
 
 
-def pack(
-    layout: Layout, parts: Mapping[str, np.ndarray], lead: tuple[int, ...]
-) -> Float[np.ndarray, "n *lead size"]:
-    """As `Layout.pack`, from parts of shape ``(*block.shape, *lead, n)``: worlds last.
-
-    Args:
-        layout: of observations, or of the joint state.
-        parts: one array per block.
-        lead: n, and N for observations.
-
-    Raises:
-        ValueError: the names are not exactly those of the blocks.
-    """
-    if parts.keys() != layout.slices.keys():
-        raise ValueError(f"parts {sorted(parts)} do not match the blocks {sorted(layout.slices)}")
-    worlds, *agents = lead
-    # a little longer than the worlds: rows a power of two apart evict each other from the cache
-    flat = np.empty((layout.size, *agents, worlds + 16), np.float32)[..., :worlds]
-    for block in layout.blocks:
-        rows = flat[layout.slices[block.name]]
-        rows.reshape(*block.shape, *rows.shape[1:], copy=False)[...] = parts[block.name]
-    packed = np.empty((*lead, layout.size), np.float32)
-    # and so do too many of them
-    for start in range(0, layout.size, _COLUMNS):
-        packed[..., start : start + _COLUMNS] = flat[start : start + _COLUMNS].T
-    return packed
+def numbers(params: DroneParams, names: type) -> dict[str, Any]:
+    """The numbers of a task that a record of numbers names."""
+    return {name: value for name, value in params.model_dump().items() if name in names.__annotations__}

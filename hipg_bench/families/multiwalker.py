@@ -1,35 +1,49 @@
 """Multi-walker: N bipeds carry one plank on their heads.
 
-Who: walkers in a row, each with servos in its legs; the plank lies free on their heads, kept from
-sliding by ridges and rails. What pays: the plank's way forward, up to a rewarded speed. What
-hurts: a walker that tips over or sinks down goes limp for good, lies in the way, and leaves its
-share of the plank to the others. When it ends: when the plank touches the ground, when all
-walkers fell, or at the horizon.
+Agents: walkers in a row, each with servos in its legs; the plank lies free on their heads, kept from sliding
+by ridges and rails. Reward: the plank's way forward, up to a rewarded speed. Hazard: a walker that tips over
+or sinks down goes limp for good, lies in the way, and leaves its share of the plank to the others. End: when
+the plank touches the ground, when all walkers fell, or at the horizon.
+
+Everything is read from generalised coordinates, which do not lag behind the physics: no derived field of
+MuJoCo is needed, and a saved row says all.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
 import pydantic
 from jaxtyping import Bool, Float, Int
 
-from hipg_bench.families import walker_body
-from hipg_bench.families.family import EVERY, Harm, Rows
-from hipg_bench.families.walker_body import Body, Pose
+from hipg_bench.families import family, walker_body
+from hipg_bench.families.walker_body import sole_height
 from hipg_bench.layout import SHARE, UNIT, Block, Layout, TaskLayout
-from hipg_bench.sim import Sim
+from hipg_bench.mechanics.geometry import mean
 from hipg_bench.spec import Params as BaseParams
-from hipg_bench.spec import TaskSpec, parse
+from hipg_bench.spec import TaskSpec
 
 _PHYSICS_STEP = 0.01
 """Seconds per physics step."""
-_TOUCH = 0.002
+TOUCH = 0.002
 """A foot whose sole is lower than this touches the ground, m."""
+JOINT_SPREAD = 0.04
+"""Servo joints start this near the stance, rad."""
+PLACE_SPREAD = 0.02
+"""Bodies start this near their place, m and rad."""
+SPEED_SPREAD = 0.1
+"""Torsos start with up to this speed along each axis, m/s and rad/s."""
+TIPPED, SUNK = 0, 1
+DROPPED, ALL_FALLEN = 3, 4
+
+PHYSICS = {"QPOS": ("coordinate",), "QVEL": ("rate",), "CTRL": ("control",)}
+CAUSES = ("tipped", "sunk")
+REASONS = ("dropped", "all_fallen")
+RENDERING = "hipg_bench.rendering.walkers:Carrying"
 
 
 class Params(BaseParams):
@@ -58,305 +72,475 @@ class Params(BaseParams):
     drop_height: float = pydantic.Field(ge=0, le=0.5)
 
 
-@dataclasses.dataclass
-class Snapshot:
-    """The world at the end of a control step."""
+class World(family.World):
+    """What evolves."""
 
-    body: Body
-    pose: Pose
-    action: Float[np.ndarray, "B N A"]  # the last one
-    health: Float[np.ndarray, "B N"]
-    down: Float[np.ndarray, "B N"]  # control steps in a row tipped or sunk
-    plank_low: Float[np.ndarray, "B"]  # height of the plank's lowest corner, m
-    felt: tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None = None  # own bodies and the plank
-
-    @functools.cached_property
-    def touch(self) -> Bool[np.ndarray, "B N 2"]:
-        """Feet on the ground."""
-        # single precision tells a sole's height to a micrometre, and its sines are ten times faster
-        joint = self.pose.joint.astype(np.float32)
-        sole = walker_body.sole_height(self.body, self.pose.rotation[:, :-1], joint)
-        return self.pose.position[:, :-1, 2, None] + sole < _TOUCH
+    coordinate: Float[np.ndarray, "Q"]  # of each walker its root and two legs, then of the plank its root
+    rate: Float[np.ndarray, "V"]
+    control: Float[np.ndarray, "N A"]  # servo targets, the last action
+    down: Float[np.ndarray, "N"]  # control steps in a row tipped or sunk
+    displacement: float  # of the plank, m
+    slip: float  # of the plank over its live carriers, m
 
 
-class MultiWalker:
-    """Rules of multi-walker; see `hipg_bench.families.family.Family` for each method."""
+class Previous(family.Previous):
+    """What a control step is compared with."""
 
-    causes: tuple[str, ...] = ("tipped", "sunk")
-    metrics: tuple[str, ...] = ("displacement", "slip", "carriers", "tipped", "sunk", "dropped")
+    x: Float[np.ndarray, "M"]  # of the walkers and the plank, m
+    control: Float[np.ndarray, "N A"]
 
-    def __init__(self, spec: TaskSpec) -> None:
-        self.spec = spec
-        self.params = params = parse(Params, spec.params, spec.task)
-        n = spec.num_agents
-        self.body = body = walker_body.body_of(params.planar)
-        self.physics_steps = max(1, round(spec.control_step / _PHYSICS_STEP))
-        self.fields: Mapping[str, int] = {"down": n, "displacement": 1, "slip": 1}
-        self.chance_size = walker_body.chance_size(body, n)
-        self._seats = walker_body.seats(n, params.spacing)
-        self._servos = 2 * int(body.servo.sum())
-        self._corners = walker_body.plank_corners(n, params.spacing, params.overhang)
-        # in the plane, vectors have x and z only, and turning has y only
-        self._axes, self._turns = (slice(0, 3, 2), slice(1, 2)) if params.planar else (slice(3), slice(3))
-        self._dims, self._spins = (2, 1) if params.planar else (3, 3)
-        # the plank's long axis points up by the pitch, aside by the yaw; its side axis points up by the roll
-        self._lie = ([2], [0]) if params.planar else ([2, 2, 1], [0, 1, 0])
-        self.layout = TaskLayout(self._observation(), self._action(), self._state())
 
-    def scene(self) -> mujoco.MjSpec:
-        """N walkers in a row under a plank."""
-        params = self.params
-        n = self.spec.num_agents
-        scene = walker_body.walker_scene(self.body, n, params.spacing, params.overhang, params.plank_mass * n)
-        scene.option.timestep = self.spec.control_step / self.physics_steps
-        return scene
+class Scratch(family.Scratch):
+    """Where everything is and how it moves; of the M = N + 1 free bodies the plank is the last."""
 
-    def reset(self, sim: Sim, ids: Int[np.ndarray, "n"], chance: Float[np.ndarray, "n K"]) -> None:
-        """Walkers stand nearly in the stance, the plank lies nearly in its place."""
-        walker_body.place(self.body, sim, ids, chance, self._seats)
+    place: Float[np.ndarray, "M 3"]  # m, world
+    turn: Float[np.ndarray, "M 3 3"]  # body to world
+    speed: Float[np.ndarray, "M 3"]  # m/s, world
+    spin: Float[np.ndarray, "M 3"]  # rad/s, own frame
+    touch: Bool[np.ndarray, "N 2"]  # feet on the ground
+    plank_low: float  # height of the plank's lowest corner, m
+    square: Float[np.ndarray, "N*A"]
 
-    def act(self, sim: Sim, was: Snapshot, action: Float[np.ndarray, "B N A"]) -> None:
-        """Servo targets, around the stance."""
-        sim.control[:] = action.reshape(len(action), -1)
 
-    def read(self, sim: Sim, rows: Rows = EVERY) -> Snapshot:
-        """Everything follows from the generalised coordinates, which do not lag behind the physics."""
-        pose = walker_body.pose(self.body, sim, rows)
-        x, y, z = (pose.rotation[:, -1, 2, k, None] * self._corners[:, k] for k in range(3))
-        return Snapshot(
-            body=self.body,
-            pose=pose,
-            action=sim.control[rows].reshape(len(pose.position), -1, self._servos).copy(),
-            health=sim.field["health"][rows].copy(),
-            down=sim.field["down"][rows].copy(),
-            plank_low=pose.position[:, -1, 2] + (x + y + z).min(axis=1),
-        )
+class Numbers(family.Numbers):
+    """Numbers of the task, see `Params`, and of the body, see `walker_body.Body`."""
 
-    def renew(self, sim: Sim, now: Snapshot, ids: Int[np.ndarray, "n"], fresh: Snapshot) -> Snapshot:
-        """Walkers fall at all times: in most steps a few worlds of many begin anew."""
-        for whole, part in ((now, fresh), (now.pose, fresh.pose)):
-            for name, array in vars(part).items():
-                if isinstance(array, np.ndarray):
-                    vars(whole)[name][ids] = array
-        now.felt = None
-        return now
+    planar: bool
+    spacing: float
+    speed_cap: float
+    upright: float
+    sunk: float
+    fall_steps: float
+    drop_height: float
+    height: float
+    head_top: float
+    plank_rest: float
+    hip: Float[np.ndarray, "2 3"]
+    thigh: float
+    shin: float
+    sole: Float[np.ndarray, "3"]
+    sole_size: Float[np.ndarray, "2"]
+    sole_radius: float
+    stance: Float[np.ndarray, "2 L"]
+    servo: Bool[np.ndarray, "L"]
+    root_q: int
+    root_v: int
+    seats: Float[np.ndarray, "N"]  # along the plank, from its middle, m
+    corners: Float[np.ndarray, "8 3"]  # of the plank, in its frame, m
+    axes: Int[np.ndarray, "D"]  # along which vectors are observed: x, y and z, or x and z
+    turns: Int[np.ndarray, "U"]  # about which turning is observed
+    lie_row: Int[np.ndarray, "U"]  # entries of the plank's rotation that tell how it lies
+    lie_column: Int[np.ndarray, "U"]
 
-    def harm(self, was: Snapshot, now: Snapshot) -> Harm:
-        """Whoever is tipped or sunk for long enough has fallen."""
-        tipped, _ = self._off_feet(now)
-        fatal = self._down(was, now) >= self.params.fall_steps
-        return Harm(np.zeros(fatal.shape), fatal, cause=np.where(tipped, 0, 1))
 
-    def remember(self, sim: Sim, was: Snapshot, now: Snapshot) -> Snapshot:
-        """Count the steps off one's feet, the plank's way, and how far it left its live carriers behind."""
-        down = self._down(was, now)
-        sim.field["down"][:] = down
-        moved = now.pose.position[..., 0] - was.pose.position[..., 0]
-        live = now.health > 0
-        carried = np.where(live, moved[:, :-1], 0.0).sum(axis=1) / np.maximum(live.sum(axis=1), 1)
-        sim.field["displacement"][:, 0] += moved[:, -1]
-        sim.field["slip"][:, 0] += moved[:, -1] - carried
-        now.down = down
-        return now
+class Terms(family.Terms):
+    """Parts of the team reward, before weights."""
 
-    def reward(self, was: Snapshot, now: Snapshot) -> dict[str, Float[np.ndarray, "B"]]:
-        """Terms of the step.
+    progress: float  # the plank's way along x, m, at most the capped speed's
+    fall: float  # share of the team that fell in the step
+    drop: float  # 1 where the plank is lost: on the ground, or with nobody left under it
+    effort: float  # mean square of the actions
+    jerk: float  # mean square of their change
+    alive: float  # share on its feet; tasks do not pay for it, but training may: standing must earn nothing
 
-        ``progress``: the plank's way along x, m, at most the capped speed's; ``fall``: share of the team that
-        fell in it; ``drop``: 1 where the plank is lost: on the ground, or with nobody left under it;
-        ``effort``, ``jerk``: mean square of the actions and of their change; ``alive``: share of the team on
-        its feet, which the tasks do not pay for but training may (standing still must earn nothing).
-        """
-        moved = now.pose.position[:, -1, 0] - was.pose.position[:, -1, 0]
-        fell = (was.health > 0) & (now.health == 0)
-        n = self.spec.num_agents
-        return {
-            "progress": np.minimum(moved, self.params.speed_cap * self.spec.control_step),
-            "fall": fell.sum(axis=1) / n,
-            "drop": (self._dropped(now) | self._fallen(now)).astype(np.float64),
-            "effort": np.square(now.action).mean(axis=(1, 2)),
-            "jerk": np.square(now.action - was.action).mean(axis=(1, 2)),
-            "alive": (now.health > 0).sum(axis=1) / n,
-        }
 
-    def terminated(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B"], str | np.ndarray]:
-        """When the plank is on the ground, or nobody is left to carry it."""
-        dropped, fallen = self._dropped(now), self._fallen(now)
-        return dropped | fallen, np.where(dropped, "dropped", "all_fallen")
+class Metrics(family.Metrics):
+    """Of an episode."""
 
-    def observe(self, now: Snapshot) -> Float[np.ndarray, "n N O"]:
-        """Own body exactly, the plank above one's head, and the neighbours before and behind."""
-        pose = now.pose
-        own, plank = self._felt(now)
-        head = pose.position[:, :-1] + self.body.head_top * pose.rotation[:, :-1, :, 2]
-        # into the plank's frame
-        seat = np.einsum("...ni,...ij->...nj", head - pose.position[:, -1:], pose.rotation[:, -1])
-        seat[..., 0] -= self._seats
-        parts = {
-            "health": now.health[..., None],
-            "height": pose.position[:, :-1, 2:],
-            **own,
-            "head_on_plank": seat[..., self._axes],
-            **{name: part[:, None] for name, part in plank.items()},
-            **self._neighbors(now),
-        }
-        return self.layout.observation.pack(parts, now.health.shape)
+    displacement: float  # of the plank, m
+    slip: float  # of it, over its live carriers, m
+    carriers: float  # alive at the end
+    tipped: float
+    sunk: float
+    dropped: float
 
-    def state(self, now: Snapshot) -> Float[np.ndarray, "n S"]:
-        """All bodies, and how long each walker has been off its feet."""
-        pose = now.pose
-        own, plank = self._felt(now)
-        place = pose.position[:, :-1] - pose.position[:, -1:]
-        place[..., 0] -= self._seats
-        parts = {
-            "health": now.health,
-            "down": now.down,
-            "place": place[..., self._axes],
-            **own,
-            "plank_position": pose.position[:, -1, self._axes],
-            **plank,
-        }
-        return self.layout.state.pack(parts, now.health.shape[:1])
 
-    def measure(
-        self, sim: Sim, ids: Int[np.ndarray, "n"], now: Snapshot
-    ) -> dict[str, Float[np.ndarray, "n"]]:
-        """Way of the plank and of it the slip over its live carriers, m; live carriers; falls by cause."""
-        field = sim.field
-        dead = field["health"][ids] == 0
-        cause = field["death_cause"][ids]
-        return {
-            "displacement": field["displacement"][ids, 0],
-            "slip": field["slip"][ids, 0],
-            "carriers": (~dead).sum(axis=1),
-            "tipped": (dead & (cause == 0)).sum(axis=1),
-            "sunk": (dead & (cause == 1)).sum(axis=1),
-            "dropped": self._dropped(now)[ids],
-        }
+# --- rules, in the order of a step ---------------------------------------------------------------------
 
-    def _off_feet(self, now: Snapshot) -> tuple[Bool[np.ndarray, "B N"], Bool[np.ndarray, "B N"]]:
-        """Who is tipped, and who is sunk."""
-        tipped = now.pose.rotation[:, :-1, 2, 2] < self.params.upright
-        return tipped, now.pose.position[:, :-1, 2] < self.params.sunk * self.body.height
 
-    def _down(self, was: Snapshot, now: Snapshot) -> Float[np.ndarray, "B N"]:
-        """Control steps in a row off one's feet, up to those that make a fall."""
-        tipped, sunk = self._off_feet(now)
-        return np.where(tipped | sunk, np.minimum(was.down + 1, self.params.fall_steps), 0.0)
+def begin(w: World, scratch: Scratch, task: Numbers, random: Float[np.ndarray, "C"]) -> None:
+    """Walkers stand nearly in the stance, the plank lies nearly in its place on their heads."""
+    agents, joints, k = len(w.health), len(task.servo), 0
+    highest = -math.inf
+    for i in range(agents):
+        root = i * (task.root_q + 2 * joints)
+        leg, lowest = root + task.root_q, math.inf
+        for side in range(2):
+            for joint in range(joints):
+                w.coordinate[leg + joint] = task.stance[side, joint]
+                if task.servo[joint]:
+                    w.coordinate[leg + joint] += JOINT_SPREAD * (2 * random[k] - 1)
+                    k += 1
+            if not task.planar:  # feet level
+                w.coordinate[leg + 3] = w.coordinate[leg + 2] - w.coordinate[leg + 1]
+            # turning about the vertical lifts no foot
+            angle = w.coordinate[leg : leg + joints]
+            lowest = min(lowest, sole_height(task, side, 0.0, 0.0, 1.0, angle))
+            leg += joints
+        highest = max(highest, -lowest)
+        put(w.coordinate, task, root, task.seats[i], -lowest, random[k:])
+        k += 3
+        for axis in range(task.root_v):
+            w.rate[i * (task.root_v + 2 * joints) + axis] = SPEED_SPREAD * (2 * random[k] - 1)
+            k += 1
+    put(w.coordinate, task, agents * (task.root_q + 2 * joints), 0.0, highest + task.plank_rest, random[k:])
 
-    def _dropped(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
-        return now.plank_low < self.params.drop_height
 
-    def _fallen(self, now: Snapshot) -> Bool[np.ndarray, "B"]:
-        return (now.health == 0).all(axis=1)
+def put(
+    coordinate: Float[np.ndarray, "Q"],
+    task: Numbers,
+    root: int,
+    x: float,
+    z: float,
+    random: Float[np.ndarray, "C"],
+) -> None:
+    """Put an upright free body near a place; in the plane there is neither y nor yaw."""
+    x += PLACE_SPREAD * (2 * random[0] - 1)
+    if task.planar:
+        coordinate[root], coordinate[root + 1], coordinate[root + 2] = x, z, 0.0
+        return
+    half = PLACE_SPREAD * (2 * random[2] - 1) / 2
+    coordinate[root], coordinate[root + 1], coordinate[root + 2] = x, PLACE_SPREAD * (2 * random[1] - 1), z
+    coordinate[root + 3], coordinate[root + 6] = math.cos(half), math.sin(half)
+    coordinate[root + 4], coordinate[root + 5] = 0.0, 0.0
 
-    def _felt(self, now: Snapshot) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Own bodies and the plank, as observations and joint states have them alike."""
-        if now.felt is None:
-            now.felt = self._proprioception(now), self._plank(now)
-        return now.felt
 
-    def _proprioception(self, now: Snapshot) -> dict[str, np.ndarray]:
-        """What each walker feels of its own body; the blocks of `_proprioception_blocks`."""
-        pose = now.pose
-        rotation = pose.rotation[:, :-1]
-        # v R is R^T v: from the world into the body's frame
-        velocity = np.einsum("...i,...ij->...j", pose.velocity[:, :-1], rotation)
-        parts = {
-            "up": rotation[..., 2, self._axes],
-            "heading": rotation[..., 0, :],
-            "velocity": velocity[..., self._axes],
-            "spin": pose.spin[:, :-1, self._turns],
-            "joint": pose.joint,
-            "joint_rate": pose.joint_rate,
-            "touch": now.touch,
-            "action": now.action,
-        }
-        if self.params.planar:
-            del parts["heading"]
-        return parts
+def act(
+    w: World, previous: Previous, scratch: Scratch, task: Numbers, command: Float[np.ndarray, "N A"]
+) -> None:
+    """Servo targets, around the stance."""
+    agents, servos = command.shape
+    for m in range(agents + 1):
+        previous.x[m] = w.coordinate[m * (task.root_q + 2 * len(task.servo))]
+    for i in range(agents):
+        for k in range(servos):
+            previous.control[i, k] = w.control[i, k]
+            w.control[i, k] = command[i, k]
 
-    def _plank(self, now: Snapshot) -> dict[str, np.ndarray]:
-        """How the plank lies and moves; the blocks of `_plank_blocks`."""
-        rotation, velocity = now.pose.rotation[:, -1], now.pose.velocity[:, -1]
-        return {
-            "plank_lie": rotation[:, *self._lie],
-            "plank_velocity": velocity[:, self._axes],
-            "plank_spin": now.pose.spin[:, -1, self._turns],
-        }
 
-    def _neighbors(self, now: Snapshot) -> dict[str, np.ndarray]:
-        """The walkers behind and before each one: gap beyond the seats' spacing, and relative velocity."""
-        there = np.ones((*now.health.shape, 2))
-        there[:, 0, 0] = there[:, -1, 1] = 0
-        health = np.zeros_like(there)
-        health[:, 1:, 0], health[:, :-1, 1] = now.health[:, :-1], now.health[:, 1:]
-        gap, speed = np.zeros((2, *there.shape, 3))
-        way, lead = (of[:, 1:-1] - of[:, :-2] for of in (now.pose.position, now.pose.velocity))
-        way[..., 0] -= self.params.spacing
-        gap[:, 1:, 0], gap[:, :-1, 1] = -way, way
-        speed[:, 1:, 0], speed[:, :-1, 1] = -lead, lead
-        return {
-            "neighbor_there": there,
-            "neighbor_health": health,
-            "neighbor_gap": gap[..., self._axes],
-            "neighbor_velocity": speed[..., self._axes],
-        }
+def read(w: World, scratch: Scratch, task: Numbers) -> None:
+    """Work out where all bodies are, and how low the plank hangs."""
+    agents, legs = len(w.health), 2 * len(task.servo)
+    coordinate, rate = w.coordinate, w.rate
+    place, turn, speed, spin = scratch.place, scratch.turn, scratch.speed, scratch.spin
+    for m in range(agents + 1):
+        root, moves = m * (task.root_q + legs), m * (task.root_v + legs)
+        if task.planar:
+            place[m, 0], place[m, 1], place[m, 2] = coordinate[root], 0.0, coordinate[root + 1]
+            speed[m, 0], speed[m, 1], speed[m, 2] = rate[moves], 0.0, rate[moves + 1]
+            spin[m, 0], spin[m, 1], spin[m, 2] = 0.0, rate[moves + 2], 0.0
+            pitch(turn[m], coordinate[root + 2])
+        else:
+            for axis in range(3):
+                place[m, axis], speed[m, axis] = coordinate[root + axis], rate[moves + axis]
+                spin[m, axis] = rate[moves + 3 + axis]
+            rotate(turn[m], coordinate[root + 3 : root + 7])
+    lowest = math.inf
+    for k in range(len(task.corners)):
+        x, y = turn[agents, 2, 0] * task.corners[k, 0], turn[agents, 2, 1] * task.corners[k, 1]
+        lowest = min(lowest, x + y + turn[agents, 2, 2] * task.corners[k, 2])
+    scratch.plank_low = place[agents, 2] + lowest
 
-    def _observation(self) -> Layout:
-        d, there = self._dims, "where there is one, dead or alive"
-        return Layout((
+
+def rotate(turn: Float[np.ndarray, "3 3"], quaternion: Float[np.ndarray, "4"]) -> None:
+    """Write the rotation matrix of a quaternion (w, x, y, z), normalised here."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    size = math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / size, x / size, y / size, z / size
+    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    xx, xy, xz = 2 * x * x, 2 * x * y, 2 * x * z
+    yy, yz, zz = 2 * y * y, 2 * y * z, 2 * z * z
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1 - (yy + zz), xy - wz, xz + wy
+    turn[1, 0], turn[1, 1], turn[1, 2] = xy + wz, 1 - (xx + zz), yz - wx
+    turn[2, 0], turn[2, 1], turn[2, 2] = xz - wy, yz + wx, 1 - (xx + yy)
+
+
+def pitch(turn: Float[np.ndarray, "3 3"], angle: float) -> None:
+    """Write the rotation matrix of a turn about the y axis."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turn[0, 0], turn[0, 1], turn[0, 2] = cosine, 0.0, sine
+    turn[1, 0], turn[1, 1], turn[1, 2] = 0.0, 1.0, 0.0
+    turn[2, 0], turn[2, 1], turn[2, 2] = -sine, 0.0, cosine
+
+
+def harm(w: World, previous: Previous, scratch: Scratch, task: Numbers) -> None:
+    """Whoever is tipped or sunk for long enough has fallen."""
+    for i in range(len(w.health)):
+        tipped = scratch.turn[i, 2, 2] < task.upright
+        off_feet = tipped or scratch.place[i, 2] < task.sunk * task.height
+        w.down[i] = min(w.down[i] + 1, task.fall_steps) if off_feet else 0.0
+        scratch.fatal[i] = w.down[i] >= task.fall_steps
+        scratch.cause[i] = TIPPED if tipped else SUNK
+
+
+def update(w: World, previous: Previous, scratch: Scratch, task: Numbers) -> None:
+    """Add up the plank's way, and how far it left its live carriers behind."""
+    agents, carried, live = len(w.health), 0.0, 0
+    for i in range(agents):
+        if w.health[i] > 0:
+            carried += scratch.place[i, 0] - previous.x[i]
+            live += 1
+    moved = scratch.place[agents, 0] - previous.x[agents]
+    w.displacement += moved
+    w.slip += moved - carried / max(live, 1)
+
+
+def reward(w: World, previous: Previous, scratch: Scratch, task: Numbers, terms: Terms) -> None:
+    """Pay for the plank's way forward; charge for falls, a lost plank, and effort."""
+    agents, servos = w.control.shape
+    fell, live = 0, 0
+    for i in range(agents):
+        fell += 1 if previous.health[i] > 0 and w.health[i] == 0 else 0
+        live += 1 if w.health[i] > 0 else 0
+    moved = scratch.place[agents, 0] - previous.x[agents]
+    terms.progress = min(moved, task.speed_cap * task.control_step)
+    terms.fall, terms.alive = fell / agents, live / agents
+    terms.drop = 1.0 if end(w, scratch, task) != 0 else 0.0
+    square = scratch.square
+    for i in range(agents):
+        for k in range(servos):
+            square[i * servos + k] = w.control[i, k] * w.control[i, k]
+    terms.effort = mean(square)
+    for i in range(agents):
+        for k in range(servos):
+            change = w.control[i, k] - previous.control[i, k]
+            square[i * servos + k] = change * change
+    terms.jerk = mean(square)
+
+
+def end(w: World, scratch: Scratch, task: Numbers) -> int:
+    """When the plank is on the ground, or nobody is left to carry it."""
+    if scratch.plank_low < task.drop_height:
+        return DROPPED
+    for i in range(len(w.health)):
+        if w.health[i] > 0:
+            return 0
+    return ALL_FALLEN
+
+
+def survey(w: World, scratch: Scratch, task: Numbers) -> None:
+    """Find the feet that touch the ground."""
+    joints = len(task.servo)
+    for i in range(len(w.health)):
+        up = scratch.turn[i, 2]
+        for side in range(2):
+            leg = i * (task.root_q + 2 * joints) + task.root_q + side * joints
+            sole = sole_height(task, side, up[0], up[1], up[2], w.coordinate[leg : leg + joints])
+            scratch.touch[i, side] = scratch.place[i, 2] + sole < TOUCH
+
+
+def observe(w: World, scratch: Scratch, task: Numbers, i: int, seen: Any) -> None:
+    """Own body exactly, the plank above one's head, and the neighbours behind and ahead."""
+    agents, place, speed, turn = len(w.health), scratch.place, scratch.speed, scratch.turn
+    seen.health[0], seen.height[0] = w.health[i], place[i, 2]
+    feel(
+        w, scratch, task, i, seen.up, seen.heading, seen.velocity, seen.spin, seen.joint, seen.joint_rate,
+        seen.touch, seen.action,
+    )  # fmt: skip
+    for k in range(len(task.axes)):  # the head in the plank's frame, from its seat
+        axis, along = task.axes[k], 0.0
+        for of in range(3):
+            head = place[i, of] + task.head_top * turn[i, of, 2]
+            along += (head - place[agents, of]) * turn[agents, of, axis]
+        seen.head_on_plank[k] = along - task.seats[i] if axis == 0 else along
+    describe_plank(w, scratch, task, seen)
+    for side in range(2):
+        j = i + 2 * side - 1
+        there = 0 <= j < agents
+        seen.neighbor_there[side] = 1.0 if there else 0.0
+        seen.neighbor_health[side] = w.health[j] if there else 0.0
+        for k in range(len(task.axes)):
+            axis = task.axes[k]
+            beyond = task.spacing * (2 * side - 1) if axis == 0 else 0.0
+            seen.neighbor_gap[side, k] = place[j, axis] - place[i, axis] - beyond if there else 0.0
+            seen.neighbor_velocity[side, k] = speed[j, axis] - speed[i, axis] if there else 0.0
+
+
+def feel(
+    w: World,
+    scratch: Scratch,
+    task: Numbers,
+    i: int,
+    up: Any,
+    heading: Any,
+    velocity: Any,
+    spin: Any,
+    joint: Any,
+    joint_rate: Any,
+    touch: Any,
+    action: Any,
+) -> None:
+    """Write what a walker feels of its own body."""
+    turn, speed, joints = scratch.turn, scratch.speed, len(task.servo)
+    for k in range(len(task.axes)):
+        axis = task.axes[k]
+        up[k] = turn[i, 2, axis]
+        # from the world into the body's frame
+        along = 0.0
+        for of in range(3):
+            along += speed[i, of] * turn[i, of, axis]
+        velocity[k] = along
+    for axis in range(len(heading)):
+        heading[axis] = turn[i, 0, axis]
+    for k in range(len(task.turns)):
+        spin[k] = scratch.spin[i, task.turns[k]]
+    for side in range(2):
+        touch[side] = 1.0 if scratch.touch[i, side] else 0.0
+        for k in range(joints):
+            leg = side * joints + k
+            joint[side, k] = w.coordinate[i * (task.root_q + 2 * joints) + task.root_q + leg]
+            joint_rate[side, k] = w.rate[i * (task.root_v + 2 * joints) + task.root_v + leg]
+    for k in range(len(action)):
+        action[k] = w.control[i, k]
+
+
+def describe_plank(w: World, scratch: Scratch, task: Numbers, seen: Any) -> None:
+    """Write how the plank lies and moves."""
+    plank = len(w.health)
+    for k in range(len(task.turns)):
+        seen.plank_lie[k] = scratch.turn[plank, task.lie_row[k], task.lie_column[k]]
+        seen.plank_spin[k] = scratch.spin[plank, task.turns[k]]
+    for k in range(len(task.axes)):
+        seen.plank_velocity[k] = scratch.speed[plank, task.axes[k]]
+
+
+def state(w: World, scratch: Scratch, task: Numbers, state: Any) -> None:
+    """All bodies, and how long each walker has been off its feet."""
+    plank, place = len(w.health), scratch.place
+    for i in range(plank):
+        state.health[i], state.down[i] = w.health[i], w.down[i]
+        feel(
+            w, scratch, task, i, state.up[i], state.heading[i], state.velocity[i], state.spin[i],
+            state.joint[i], state.joint_rate[i], state.touch[i], state.action[i],
+        )  # fmt: skip
+        for k in range(len(task.axes)):
+            beyond = place[i, task.axes[k]] - place[plank, task.axes[k]]
+            state.place[i, k] = beyond - task.seats[i] if k == 0 else beyond
+    for k in range(len(task.axes)):
+        state.plank_position[k] = place[plank, task.axes[k]]
+    describe_plank(w, scratch, task, state)
+
+
+def metrics(w: World, scratch: Scratch, task: Numbers, metrics: Metrics) -> None:
+    """Way of the plank, carriers, and falls by cause."""
+    metrics.displacement, metrics.slip = w.displacement, w.slip
+    metrics.dropped = 1.0 if scratch.plank_low < task.drop_height else 0.0
+    metrics.carriers, metrics.tipped, metrics.sunk = 0.0, 0.0, 0.0
+    for i in range(len(w.health)):
+        if w.health[i] > 0:
+            metrics.carriers += 1.0
+        elif w.death_cause[i] == TIPPED:
+            metrics.tipped += 1.0
+        elif w.death_cause[i] == SUNK:
+            metrics.sunk += 1.0
+
+
+# --- declarations --------------------------------------------------------------------------------------
+
+
+def physics_steps(spec: TaskSpec) -> int:
+    """Physics steps per control step."""
+    return max(1, round(spec.control_step / _PHYSICS_STEP))
+
+
+def layout(spec: TaskSpec, params: Params) -> TaskLayout:
+    """Walkers feel their own body, the plank and their neighbours; critics see all bodies."""
+    n, body = spec.num_agents, walker_body.body_of(params.planar)
+    d, there = 2 if params.planar else 3, "where there is one, dead or alive"
+    servos = int(body.servo.sum())
+    what = "hip, knee" if params.planar else "hip abduction, hip, knee"
+    return TaskLayout(
+        observation=Layout((
             Block("health", (1,), "1", limits=SHARE),
             Block("height", (1,), "m", "world"),
-            *self._proprioception_blocks(()),
+            *_body_blocks(params, ()),
             Block("head_on_plank", (d,), "m", "plank, from one's seat"),
-            *self._plank_blocks(),
+            *_plank_blocks(params),
             Block("neighbor_there", (2,), "1", "-", "behind, ahead", limits=SHARE),
             Block("neighbor_health", (2,), "1", "-", there, limits=SHARE),
             Block("neighbor_gap", (2, d), "m", "own place, less the seats' spacing", there),
             Block("neighbor_velocity", (2, d), "m/s", "world, relative", there),
-        ))  # fmt: skip
-
-    def _action(self) -> Layout:
-        servos = self._servos // 2
-        what = "hip, knee" if self.params.planar else "hip abduction, hip, knee"
-        return Layout(
-            (Block("servo_target", (2, servos), f"of the range of left and right {what}", "from the stance"),)
-        )
-
-    def _state(self) -> Layout:
-        n, d = self.spec.num_agents, self._dims
-        return Layout((
+        )),
+        action=Layout((
+            Block("servo_target", (2, servos), f"of the range of left and right {what}", "from the stance"),
+        )),
+        state=Layout((
             Block("health", (n,), "1", limits=SHARE),
             Block("down", (n,), "control steps off one's feet"),
             Block("place", (n, d), "m", "world, from the plank's middle and one's seat"),
-            *self._proprioception_blocks((n,)),
+            *_body_blocks(params, (n,)),
             Block("plank_position", (d,), "m", "world"),
-            *self._plank_blocks(),
-        ))  # fmt: skip
+            *_plank_blocks(params),
+        )),
+    )  # fmt: skip
 
-    def _proprioception_blocks(self, lead: tuple[int, ...]) -> tuple[Block, ...]:
-        d, turns, joints = self._dims, self._spins, self.body.joints
-        heading = (
-            ()
-            if self.params.planar
-            else (Block("heading", (*lead, 3), "1", "world's x axis in the body's", limits=UNIT),)
-        )
-        return (
-            Block("up", (*lead, d), "1", "world's z axis in the body's", limits=UNIT),
-            *heading,
-            Block("velocity", (*lead, d), "m/s", "body"),
-            Block("spin", (*lead, turns), "rad/s", "body"),
-            Block("joint", (*lead, 2, joints), "rad"),
-            Block("joint_rate", (*lead, 2, joints), "rad/s"),
-            Block("touch", (*lead, 2), "1"),
-            Block("action", (*lead, self._servos), "1", limits=UNIT),
-        )
 
-    def _plank_blocks(self) -> tuple[Block, ...]:
-        d, turns = self._dims, self._spins
-        return (
-            Block("plank_lie", (turns,), "1", "sines of pitch, roll and yaw"),
-            Block("plank_velocity", (d,), "m/s", "world"),
-            Block("plank_spin", (turns,), "rad/s", "plank"),
-        )
+def _body_blocks(params: Params, lead: tuple[int, ...]) -> tuple[Block, ...]:
+    body = walker_body.body_of(params.planar)
+    d, turns = (2, 1) if params.planar else (3, 3)
+    heading = 0 if params.planar else 3
+    return (
+        Block("up", (*lead, d), "1", "world's z axis in the body's", limits=UNIT),
+        Block("heading", (*lead, heading), "1", "world's x axis in the body's", limits=UNIT),
+        Block("velocity", (*lead, d), "m/s", "body"),
+        Block("spin", (*lead, turns), "rad/s", "body"),
+        Block("joint", (*lead, 2, body.joints), "rad"),
+        Block("joint_rate", (*lead, 2, body.joints), "rad/s"),
+        Block("touch", (*lead, 2), "1"),
+        Block("action", (*lead, 2 * int(body.servo.sum())), "1", limits=UNIT),
+    )
+
+
+def _plank_blocks(params: Params) -> tuple[Block, ...]:
+    d, turns = (2, 1) if params.planar else (3, 3)
+    return (
+        Block("plank_lie", (turns,), "1", "sines of pitch, roll and yaw"),
+        Block("plank_velocity", (d,), "m/s", "world"),
+        Block("plank_spin", (turns,), "rad/s", "plank"),
+    )
+
+
+def scene(spec: TaskSpec, params: Params) -> mujoco.MjSpec:
+    """N walkers in a row under a plank."""
+    n, body = spec.num_agents, walker_body.body_of(params.planar)
+    world = walker_body.walker_scene(body, n, params.spacing, params.overhang, params.plank_mass * n)
+    world.option.timestep = spec.control_step / physics_steps(spec)
+    return world
+
+
+def num_random(spec: TaskSpec, params: Params) -> int:
+    """Joints, place and speed of each walker; place of the plank."""
+    body = walker_body.body_of(params.planar)
+    return spec.num_agents * (2 * int(body.servo.sum()) + 3 + body.root_v) + 3
+
+
+def sizes(spec: TaskSpec, params: Params) -> Mapping[str, int]:
+    """Coordinates and rates of all bodies; joints of a leg; observed axes and turns."""
+    n, body = spec.num_agents, walker_body.body_of(params.planar)
+    legs = 2 * body.joints
+    return {
+        "Q": n * (body.root_q + legs) + body.root_q, "V": n * (body.root_v + legs) + body.root_v,
+        "M": n + 1, "L": body.joints, "D": 2 if params.planar else 3, "U": 1 if params.planar else 3,
+    }  # fmt: skip
+
+
+def numbers(spec: TaskSpec, params: Params) -> Mapping[str, Any]:
+    """The family's entries of `Numbers`."""
+    n, body = spec.num_agents, walker_body.body_of(params.planar)
+    of_task = ("planar", "spacing", "speed_cap", "upright", "sunk", "fall_steps", "drop_height")
+    of_body = (
+        "height", "head_top", "plank_rest", "hip", "thigh", "shin", "sole", "sole_size", "sole_radius",
+        "stance", "servo", "root_q", "root_v",
+    )  # fmt: skip
+    return {
+        **{name: getattr(params, name) for name in of_task},
+        **{name: getattr(body, name) for name in of_body},
+        "seats": walker_body.seats(n, params.spacing),
+        "corners": walker_body.plank_corners(n, params.spacing, params.overhang),
+        # in the plane, vectors have x and z only, and turning has y only
+        "axes": (0, 2) if params.planar else (0, 1, 2),
+        "turns": (1,) if params.planar else (0, 1, 2),
+        # the plank's long axis points up by the pitch, aside by the yaw; its side axis points up by the roll
+        "lie_row": (2,) if params.planar else (2, 2, 1),
+        "lie_column": (0,) if params.planar else (0, 1, 0),
+    }

@@ -1,30 +1,20 @@
-"""Walkers under a plank: the bodies of the multi-walker family, and where they are.
-
-Everything is read from generalised coordinates, which do not lag behind the physics; so no derived
-field of MuJoCo is needed, and a saved row says all.
-"""
+"""Walkers under a plank: the bodies of the multi-walker family, composed from their MJCF files."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
+from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from hipg_bench.families.family import EVERY, Rows
 from hipg_bench.families.scene import asset, attach
-from hipg_bench.sim import Sim
 
 _RIDGE_GAP = 0.2
 """Ridges under the plank stand this far before and behind each head's middle, m."""
-_JOINT_SPREAD = 0.04
-"""Servo joints start this near the stance, rad."""
-_PLACE_SPREAD = 0.02
-"""Bodies start this near their place, m and rad."""
-_SPEED_SPREAD = 0.1
-"""Torsos start with up to this speed along each axis, m/s and rad/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +69,7 @@ class Body:
     @functools.cached_property
     def height(self) -> float:
         """Of the torso's origin above the ground in the stance, m."""
-        return float(-sole_height(self, np.eye(3), self.stance).min())
+        return -min(sole_height(self, leg, 0.0, 0.0, 1.0, self.stance[leg]) for leg in range(2))
 
 
 @functools.cache
@@ -112,6 +102,37 @@ def body_of(planar: bool) -> Body:
         head_top=head_top,
         plank_rest=head_top + float(board.size[2] - board.pos[2]),
     )
+
+
+def sole_height(legs: Any, leg: int, x: float, y: float, z: float, joint: Float[np.ndarray, "L"]) -> float:
+    """Height of a foot's lowest point above the torso's origin, m.
+
+    Args:
+        legs: a `Body`, or a record of numbers with what it holds.
+        leg: 0 the left one, 1 the right one.
+        x: height of the tip of the torso's x axis above its origin, and likewise
+        y: of its y axis, and
+        z: of its z axis.
+        joint: angles of the leg, rad.
+    """
+    hip = x * legs.hip[leg, 0] + y * legs.hip[leg, 1] + z * legs.hip[leg, 2]
+    first = 0 if legs.planar else 1
+    if not legs.planar:
+        # outwards is a turn about +x for the left leg, about -x for the right one
+        turn = joint[0] if leg == 0 else -joint[0]
+        cosine, sine = math.cos(turn), math.sin(turn)
+        y, z = y * cosine + z * sine, z * cosine - y * sine
+    thigh = joint[first]
+    # a pitch p lifts the toes: in the leg's plane the foot's axes are (cos p, sin p) and (-sin p, cos p)
+    foot = thigh - joint[first + 1]
+    ankle = hip + legs.thigh * (x * math.sin(thigh) - z * math.cos(thigh))
+    ankle += legs.shin * (x * math.sin(foot) - z * math.cos(foot))
+    if not legs.planar:
+        foot += joint[3]
+    ahead = x * math.cos(foot) + z * math.sin(foot)
+    up = z * math.cos(foot) - x * math.sin(foot)
+    middle = ankle + legs.sole[0] * ahead + legs.sole[2] * up
+    return middle - legs.sole_size[0] * abs(ahead) - legs.sole_size[1] * abs(y) - legs.sole_radius
 
 
 def plank_corners(num_agents: int, spacing: float, overhang: float) -> Float[np.ndarray, "8 3"]:
@@ -206,160 +227,3 @@ def _hold_to_plane(plank: mujoco.MjSpec) -> None:
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     for name, kind, axis in (("x", slide, (1, 0, 0)), ("z", slide, (0, 0, 1)), ("pitch", hinge, (0, 1, 0))):
         body.add_joint(name=name, type=kind, axis=axis)
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    """Where everything is and how it moves; of the M = N + 1 free bodies the plank is the last.
-
-    Worlds are the first axis, yet the last in memory: so each operation sweeps over all worlds in one go,
-    which is several times faster than with short last axes.
-    """
-
-    position: Float[np.ndarray, "n M 3"]  # m, world
-    rotation: Float[np.ndarray, "n M 3 3"]  # body to world
-    velocity: Float[np.ndarray, "n M 3"]  # m/s, world
-    spin: Float[np.ndarray, "n M 3"]  # rad/s, own frame
-    joint: Float[np.ndarray, "n N 2 L"]  # rad
-    joint_rate: Float[np.ndarray, "n N 2 L"]  # rad/s
-
-
-def pose(body: Body, sim: Sim, rows: Rows = EVERY) -> Pose:
-    """Read all bodies, as copies."""
-    root, joint = _parts(sim.position[rows], body.root_q, body.joints)
-    rate, joint_rate = _parts(sim.velocity[rows], body.root_v, body.joints)
-    legs = joint.transpose(3, 0, 1, 2), joint_rate.transpose(3, 0, 1, 2)
-    if not body.planar:
-        position, rotation, velocity, spin = root[:3], _matrix(root[3:]), rate[:3], rate[3:]
-    else:
-        position, velocity, spin = (np.zeros(root.shape) for _ in range(3))
-        position[::2], velocity[::2], spin[1] = root[:2], rate[:2], rate[2]
-        rotation = _pitched(root[2])
-    vectors = (position.T, rotation.transpose(3, 2, 0, 1), velocity.T, spin.T)
-    return Pose(*vectors, *legs)
-
-
-def _parts(
-    coordinates: Float[np.ndarray, "n C"], root: int, joints: int
-) -> tuple[Float[np.ndarray, "R M n"], Float[np.ndarray, "N 2 L n"]]:
-    """Coordinates of all free bodies' roots, and of all legs."""
-    every = np.ascontiguousarray(coordinates.T)
-    walkers = every[:-root].reshape(-1, root + 2 * joints, every.shape[1])
-    roots = np.concatenate([walkers[:, :root], every[None, -root:]])
-    return roots.transpose(1, 0, 2), walkers[:, root:].reshape(len(walkers), 2, joints, -1)
-
-
-def _matrix(quaternion: Float[np.ndarray, "4 *lead"]) -> Float[np.ndarray, "3 3 *lead"]:
-    """Rotation matrices of quaternions (w, x, y, z), normalised here."""
-    unit = quaternion / np.sqrt(np.add.reduce(quaternion * quaternion))
-    (_, wx, wy, wz), (_, xx, xy, xz), (_, _, yy, yz), (_, _, _, zz) = 2 * unit[:, None] * unit
-    matrix = [
-        1 - (yy + zz), xy - wz, xz + wy,
-        xy + wz, 1 - (xx + zz), yz - wx,
-        xz - wy, yz + wx, 1 - (xx + yy),
-    ]  # fmt: skip
-    return np.concatenate(matrix).reshape(3, 3, *unit.shape[1:])
-
-
-def _pitched(angle: Float[np.ndarray, "*lead"]) -> Float[np.ndarray, "3 3 *lead"]:
-    """Rotation matrices of turns about the y axis."""
-    matrix = np.zeros((3, 3, *angle.shape))
-    matrix[0, 0] = matrix[2, 2] = np.cos(angle)
-    matrix[0, 2], matrix[1, 1] = np.sin(angle), 1
-    matrix[2, 0] = -matrix[0, 2]
-    return matrix
-
-
-def sole_height(
-    body: Body, rotation: Float[np.ndarray, "*#lead 3 3"], joint: Float[np.ndarray, "*#lead 2 L"]
-) -> Float[np.ndarray, "... 2"]:
-    """Height of each foot's lowest point above the torso's origin, m.
-
-    Args:
-        body: the walker.
-        rotation: of the torso, to the world.
-        joint: angles, rad.
-    """
-    x, y, z = (rotation[..., 2, k, None] for k in range(3))  # heights of the torso's axes
-    hip = x * body.hip[:, 0] + y * body.hip[:, 1] + z * body.hip[:, 2]
-    if body.planar:
-        thigh, shin = joint[..., 0], joint[..., 0] - joint[..., 1]
-    else:
-        # outwards is a turn about +x for the left leg, about -x for the right one
-        turn = joint[..., 0] * np.array([1, -1], joint.dtype)
-        cosine, sine = np.cos(turn), np.sin(turn)
-        y, z = y * cosine + z * sine, z * cosine - y * sine
-        thigh, shin = joint[..., 1], joint[..., 1] - joint[..., 2]
-    # a pitch p lifts the toes: in the leg's plane the foot's axes are (cos p, sin p) and (-sin p, cos p)
-    ankle = hip + body.thigh * (x * np.sin(thigh) - z * np.cos(thigh))
-    cosine, sine = np.cos(shin), np.sin(shin)
-    ankle += body.shin * (x * sine - z * cosine)
-    if not body.planar:
-        foot = shin + joint[..., 3]
-        cosine, sine = np.cos(foot), np.sin(foot)
-    ahead, up = x * cosine + z * sine, z * cosine - x * sine
-    middle = ankle + body.sole[0] * ahead + body.sole[2] * up
-    return middle - body.sole_size[0] * np.abs(ahead) - body.sole_size[1] * np.abs(y) - body.sole_radius
-
-
-def chance_size(body: Body, num_agents: int) -> int:
-    """Uniform numbers that `place` takes."""
-    return num_agents * (2 * int(body.servo.sum()) + 3 + body.root_v) + 3
-
-
-def place(
-    body: Body,
-    sim: Sim,
-    ids: Int[np.ndarray, "n"],
-    chance: Float[np.ndarray, "n K"],
-    seat: Float[np.ndarray, "N"],
-) -> None:
-    """Stand walkers on the ground, nearly in the stance, and lay the plank on their heads.
-
-    Args:
-        body: the walker.
-        sim: whose worlds ``ids`` are written.
-        ids: worlds.
-        chance: uniform numbers, `chance_size` of them.
-        seat: places along x, m.
-    """
-    count, agents = len(ids), len(seat)
-    draw = 2 * chance - 1
-    per_walker = draw[:, :-3].reshape(count, agents, -1)
-    servos = 2 * int(body.servo.sum())
-    joint = np.tile(body.stance, (count, agents, 1, 1))
-    joint[..., body.servo] += _JOINT_SPREAD * per_walker[..., :servos].reshape(count, agents, 2, -1)
-    if not body.planar:
-        joint[..., 3] = joint[..., 2] - joint[..., 1]  # feet level
-    x, y, yaw = np.moveaxis(_PLACE_SPREAD * per_walker[..., servos : servos + 3], -1, 0)
-    # turning about the vertical lifts no foot
-    ground = -sole_height(body, np.eye(3), joint).min(axis=-1)
-    board_x, board_y, board_yaw = np.moveaxis(_PLACE_SPREAD * draw[:, None, -3:], -1, 0)
-    board_z = ground.max(axis=1, keepdims=True) + body.plank_rest
-    root = _root(
-        body,
-        np.concatenate([seat + x, board_x], axis=1),
-        np.concatenate([y, board_y], axis=1),
-        np.concatenate([ground, board_z], axis=1),
-        np.concatenate([yaw, board_yaw], axis=1),
-    )
-    walker_q = np.concatenate([root[:, :-1], joint.reshape(count, agents, -1)], axis=-1)
-    sim.position[ids] = np.concatenate([walker_q.reshape(count, -1), root[:, -1]], axis=1)
-    speed = _SPEED_SPREAD * per_walker[..., servos + 3 :]
-    walker_v = np.concatenate([speed, np.zeros((count, agents, 2 * body.joints))], axis=-1).reshape(count, -1)
-    sim.velocity[ids] = 0.0
-    sim.velocity[ids, : walker_v.shape[1]] = walker_v
-
-
-def _root(
-    body: Body,
-    x: Float[np.ndarray, "n M"],
-    y: Float[np.ndarray, "n M"],
-    z: Float[np.ndarray, "n M"],
-    yaw: Float[np.ndarray, "n M"],
-) -> Float[np.ndarray, "n M R"]:
-    """Generalised positions of upright free bodies; in the plane there is neither y nor yaw."""
-    zero = np.zeros_like(x)
-    if body.planar:
-        return np.stack([x, z, zero], axis=-1)
-    return np.stack([x, y, z, np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=-1)

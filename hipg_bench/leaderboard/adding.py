@@ -9,14 +9,18 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import itertools
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from hipg_bench.documents import read_json
 from hipg_bench.errors import BoardError, BundleError, SpecError
+from hipg_bench.evaluation import runner
 from hipg_bench.evaluation.failures import OK
 from hipg_bench.evaluation.rows import read_rows
 from hipg_bench.leaderboard import films
@@ -28,6 +32,7 @@ from hipg_bench.leaderboard.rows import MOST_BYTES
 from hipg_bench.leaderboard.source import BUNDLE, Source
 from hipg_bench.paths import write_text
 from hipg_bench.policies.bundle import Agent
+from hipg_bench.policies.card import check_regular
 from hipg_bench.registry import task_spec
 from hipg_bench.submissions.check import check
 
@@ -37,6 +42,8 @@ _MOST_CURVE_BYTES = 8_000_000
 _MOST_TOLD = 20
 _LARGEST = 1e15
 """Largest number of a learning curve."""
+_ALIKE = 1e-3
+"""Share of the spread over worlds within which returns of two trainings are those of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +89,11 @@ def add(
     with board.draft(agent.name, earlier) as folder:
         _copy_card(source, folder)
         work = folder / ".work"
-        claimed = [split for split in evaluation.splits if claims is not None and _bring(claims, split, work)]
+        claimed = [
+            split
+            for split in evaluation.splits
+            if claims is not None and _bring(claims, split, work, agent, evaluation)
+        ]
         if claims is not None and not claimed:
             raise BoardError(f"{claims} holds no rows: <split>/episodes/<task>.jsonl is expected")
         hashes: dict[str, str] = {}
@@ -152,10 +163,25 @@ def _keep_films(board: Board, earlier: Entry | None, hashes: Mapping[str, str], 
                 shutil.copyfile(film, folder / "films" / film.name)
 
 
-def _bring(claims: Path, split: str, work: Path) -> bool:
-    """Lay claimed rows where the evaluation goes on from them; say whether there are any."""
+def _bring(claims: Path, split: str, work: Path, agent: Agent, evaluation: BoardEvaluation) -> bool:
+    """Lay claimed rows where the evaluation goes on from them; say whether there are any.
+
+    Raises:
+        BoardError: rows of a task that is not played here, or a file that is none or too large.
+        SpecError: the rows are refused.
+    """
+    played, _ = runner.playable(agent, evaluation.suite())
     found = sorted((claims / split / "episodes").glob("*.jsonl"))
     for path in found:
+        if path.stem not in played:
+            raise BoardError(
+                f"{path}: rows of {path.stem}, which {agent.name} does not play here; "
+                f"it plays {', '.join(played)}"
+            )
+        try:
+            check_regular(path)
+        except BundleError as error:
+            raise BoardError(str(error)) from error
         if path.stat().st_size > MOST_BYTES:
             raise BoardError(f"{path}: at most {MOST_BYTES} bytes of rows are allowed")
         text = path.read_bytes()
@@ -167,24 +193,29 @@ def _bring(claims: Path, split: str, work: Path) -> bool:
 
 
 def _refuse_alike(run: Path) -> None:
-    """Refuse training seeds that played alike in every world: they are copies of one training.
+    """Refuse training seeds that played alike: they are copies of one training, or almost.
+
+    Two are alike if in half of the worlds that both finished, their returns differ by less than
+    `_ALIKE` of how much returns vary between worlds.
 
     Raises:
         BundleError: there are such.
     """
     for path in sorted((run / "episodes").glob("*.jsonl")):
-        played: dict[int, list[tuple[Any, ...]]] = {}
+        played: dict[int, dict[int, float]] = {}
         for row in read_rows(path.read_bytes(), str(path), task_spec(path.stem)):
             if row["status"] == OK:
-                deaths = tuple(death["time"] for death in row["death_list"])
-                played.setdefault(row["train_seed"], []).append((row["world"], row["return"], *deaths))
-        seen: dict[tuple[Any, ...], int] = {}
-        for seed, outcomes in played.items():
-            first = seen.setdefault(tuple(outcomes), seed)
-            if first != seed:
+                played.setdefault(row["train_seed"], {})[row["world"]] = row["return"]
+        for (first, one), (second, other) in itertools.combinations(played.items(), 2):
+            common = sorted(one.keys() & other.keys())
+            if not common:
+                continue
+            a, b = (np.array([returns[world] for world in common]) for returns in (one, other))
+            rounding = 1e-9 * float(np.abs(a).max())
+            if np.median(np.abs(a - b)) <= max(_ALIKE * float(a.std()), rounding):
                 raise BundleError(
-                    f"{path.stem}: training seeds {first} and {seed} played alike in all {len(outcomes)} "
-                    f"worlds: every seed must be a training of its own"
+                    f"{path.stem}: training seeds {first} and {second} played alike in the {len(common)} "
+                    f"worlds that both finished: every seed must be a training of its own"
                 )
 
 

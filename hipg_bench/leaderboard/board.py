@@ -131,7 +131,7 @@ class Board:
                     if not path.startswith("hidden/"):
                         continue
                     kept = private / name / f"v{entry.version}" / path
-                    if kept.is_file() and hashlib.sha256(unpack(kept)).hexdigest() == digest:
+                    if _is_as_promised(kept, digest):
                         with replacing(self._place(name) / path) as temporary:
                             shutil.copyfile(kept, temporary)
                         copied += 1
@@ -219,6 +219,13 @@ class Board:
         shutil.rmtree(draft, ignore_errors=True)
         lock.release()
         _lock_of(draft).unlink(missing_ok=True)
+
+
+def _is_as_promised(rows: Path, digest: str) -> bool:
+    try:
+        return rows.is_file() and hashlib.sha256(unpack(rows)).hexdigest() == digest
+    except BoardError:  # damaged: the others are published nevertheless
+        return False
 
 
 def _lock_of(draft: Path) -> Path:

@@ -129,13 +129,18 @@ def private_folder(file: Path) -> Path:
 def reveal_salt(board: Path, file: Path) -> Commitment:
     """Publish the present salt; a new one can be drawn then, and what was verified with this one is outdated.
 
-    Rows of hidden worlds, which `private_folder` holds, can be published then too: `publish_rows`.
+    Rows of hidden worlds, which `private_folder` holds, can be published then too: `publish_rows`. A salt
+    that is revealed already is returned as it was, so that publishing can be repeated.
 
     Raises:
         BoardError: as `read_salt`.
     """
-    salt = read_salt(board, file)
     commitments = read_commitments(board)
+    told = file.read_text(encoding="ascii", errors="replace").strip() if file.is_file() else None
+    for past in commitments.past:
+        if past.salt is not None and past.salt == told:
+            return past
+    salt = read_salt(board, file)
     if commitments.current is None:
         raise BoardError(f"{board} was revealed meanwhile")
     kept = commitments.current.model_copy(update={"salt": salt.hex(), "revealed": now()})

@@ -12,9 +12,11 @@ own, by its hash.
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import hashlib
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -25,7 +27,7 @@ import jinja2
 import markupsafe
 
 from hipg_bench import registry
-from hipg_bench.errors import BoardError, HipgError
+from hipg_bench.errors import BoardError, BundleError, HipgError
 from hipg_bench.evaluation import export, splits
 from hipg_bench.evaluation.words import end_reason
 from hipg_bench.leaderboard import pictures, standings
@@ -33,6 +35,8 @@ from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry_view import EntryView, read_entry_view
 from hipg_bench.leaderboard.model_card import to_html
 from hipg_bench.leaderboard.salt import Commitments, read_commitments
+from hipg_bench.paths import PARTIAL, write_text
+from hipg_bench.policies.card import check_regular
 from hipg_bench.rendering import film
 from hipg_bench.spec import TaskSpec
 
@@ -78,15 +82,16 @@ class View:
 
 
 def build(board: Board, out: Path) -> View:
-    """Write the site into a folder, in place of an earlier one; return what it shows.
+    """Write the site into a folder, over an earlier one; return what it shows.
 
-    Damaged entries are left out, and the page says so. Files that somebody added to an earlier site stay.
+    Damaged entries are left out, and the page says so. Files and folders that somebody added to an earlier
+    site stay as they are: only files that an earlier build lists as its own are replaced or removed.
 
     Raises:
-        BoardError: the folder holds something else, or the board has no entries that can be shown.
+        BoardError: the folder holds something else, a file of somebody's would be overwritten, or the board
+            has no entries that can be shown.
     """
-    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
-        raise BoardError(f"{out} holds something else: choose an empty folder for the site")
+    ours = _read_mark(out)
     specs = [registry.task_spec(task) for task in registry.tagged("standard")]
     entries, left_out = _entries(board, specs)
     if left_out and not entries:
@@ -95,18 +100,12 @@ def build(board: Board, out: Path) -> View:
         raise BoardError(f"{board.root} has no entries: add one with `hipg-bench leaderboard add`")
     panels = standings.panels(entries, specs)
     view = View(entries, specs, panels, read_commitments(board.root), left_out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as place:
-        fresh, old = Path(place) / "new", Path(place) / "old"
-        fresh.mkdir()
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=PARTIAL, dir=out) as place:
+        fresh = Path(place)
         _pages(view, fresh)
         _data(view, fresh / "data")
-        _write_mark(fresh)
-        if out.exists():
-            out.rename(old)
-        fresh.rename(out)
-        if old.exists():
-            _bring_back(old, out)
+        _replace(out, ours, fresh)
     return view
 
 
@@ -137,22 +136,71 @@ def _entries(board: Board, specs: Sequence[TaskSpec]) -> tuple[list[EntryView], 
     return entries, left_out
 
 
-def _write_mark(site: Path) -> None:
-    """Note what belongs to the site: a later build replaces that and nothing else."""
-    files = sorted(path.relative_to(site).as_posix() for path in site.rglob("*") if path.is_file())
-    (site / _MARK).write_text("\n".join([_MADE, *files]) + "\n", encoding="utf-8")
+def _read_mark(site: Path) -> set[str]:
+    """The files of an earlier build in a folder, none if it is new or empty.
+
+    Raises:
+        BoardError: the folder is none of a site.
+    """
+    if not os.path.lexists(site):
+        return set()
+    if not site.is_dir():
+        raise BoardError(f"{site} is no folder: choose another one for the site")
+    mark = site / _MARK
+    if not os.path.lexists(mark):
+        if any(site.iterdir()):
+            raise BoardError(f"{site} holds something else: choose an empty folder for the site")
+        return set()
+    try:
+        check_regular(mark)
+        made, *names = mark.read_text(encoding="utf-8").splitlines()
+    except (BundleError, ValueError) as error:
+        raise BoardError(f"{mark} is damaged, so files of others cannot be told: {error}") from error
+    if made != _MADE or any(Path(name).is_absolute() or ".." in Path(name).parts for name in names):
+        raise BoardError(f"{mark} is not of `hipg-bench leaderboard build`: choose another folder")
+    return set(names)
 
 
-def _bring_back(old: Path, new: Path) -> None:
-    """Take over the files of an earlier site that `build` did not write."""
-    ours = {_MARK, *(old / _MARK).read_text(encoding="utf-8").splitlines()}
-    for path in sorted(old.rglob("*")):
-        name = path.relative_to(old)
-        target = new / name
-        added = name.as_posix() not in ours and (path.is_symlink() or not path.is_dir())
-        if added and not target.exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            path.rename(target)
+def _replace(site: Path, ours: set[str], fresh: Path) -> None:
+    """Move new files over those of an earlier build, and remove those that are no longer made.
+
+    Raises:
+        BoardError: somebody else's file is in the way; nothing is changed then.
+    """
+    names = sorted(path.relative_to(fresh).as_posix() for path in fresh.rglob("*") if path.is_file())
+    for name in names:
+        _refuse_in_the_way(site, name, ours)
+    # whatever moment it is killed at, each file of ours is listed
+    _write_mark(site, {*ours, *names})
+    for name in names:
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (fresh / name).replace(site / name)
+    for name in sorted(ours.difference(names)):
+        path = site / name
+        if path.is_file() and not _is_linked(site, name):
+            path.unlink()
+            with contextlib.suppress(OSError):  # not empty
+                path.parent.rmdir()
+    _write_mark(site, set(names))
+
+
+def _refuse_in_the_way(site: Path, name: str, ours: set[str]) -> None:
+    path = site / name
+    if (os.path.lexists(path) and name not in ours) or path.is_dir() or _is_linked(site, name):
+        raise BoardError(f"{path} is not of an earlier build and would be overwritten: move it away")
+    for folder in path.relative_to(site).parents:
+        if os.path.lexists(site / folder) and not (site / folder).is_dir():
+            raise BoardError(f"{site / folder} is in the way of a folder of the site: move it away")
+
+
+def _is_linked(site: Path, name: str) -> bool:
+    """Whether a path leads over a link within the site."""
+    path = site / name
+    return any((site / folder).is_symlink() for folder in path.relative_to(site).parents[:-1])
+
+
+def _write_mark(site: Path, names: set[str]) -> None:
+    write_text(site / _MARK, "\n".join([_MADE, *sorted(names)]) + "\n")
 
 
 def _pages(view: View, out: Path) -> None:

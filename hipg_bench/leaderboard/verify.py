@@ -18,7 +18,7 @@ from hipg_bench.evaluation.episodes import versions
 from hipg_bench.evaluation.seeds import SUITE, commitment
 from hipg_bench.leaderboard.board import Board
 from hipg_bench.leaderboard.entry import Difference, Entry, Execution, Outcome, Verification, now
-from hipg_bench.leaderboard.entry_view import EntryView, read_entry_view, rows_path
+from hipg_bench.leaderboard.entry_view import EntryView, read_entry_view
 from hipg_bench.leaderboard.playing import BoardEvaluation, Progress, keep_hidden, limited, play, quiet
 from hipg_bench.leaderboard.rows import compare, unpack
 from hipg_bench.leaderboard.salt import read_commitments
@@ -36,6 +36,7 @@ class _Comparison:
 
     compared: int
     differences: Sequence[Difference]
+    splits: Sequence[str]
 
 
 def verify(
@@ -133,15 +134,16 @@ def _compare(view: EntryView, agent: Agent, work: Path, threads: int, progress: 
     for split, evaluation in _evaluations(view, threads).items():
         run = play(agent, evaluation, split, work, progress=progress)
         ours = {path.stem: path.read_bytes() for path in (run / "episodes").glob("*.jsonl")}
+        # every file that the entry lists, played by us or not
         theirs = {
-            task: unpack(view.folder / path)
-            for task in evaluation.tasks
-            if (path := rows_path("public", split, task)) in view.entry.rows
+            path.removeprefix(f"{split}/episodes/").removesuffix(".jsonl.gz"): unpack(view.folder / path)
+            for path in view.entry.rows
+            if path.startswith(f"{split}/")
         }
         for task in sorted({*ours, *theirs}):
             differences += compare(split, task, theirs.get(task, b""), ours.get(task, b""))
             compared += ours.get(task, b"").count(b"\n")
-    return _Comparison(compared, differences)
+    return _Comparison(compared, differences, tuple(_evaluations(view, threads)))
 
 
 def _audit(
@@ -152,24 +154,25 @@ def _audit(
         return "centralised", ()
     if agent.card.tier != 2:
         return "decentralised", ()
-    evaluation = _evaluations(view, threads=1).get("standard") or next(
-        iter(_evaluations(view, threads=1).values())
-    )
-    job = evaluation.job("standard", salt, agent_seed_key)
-    worlds = next(job.batches())
-    for task, seeds in view.entry.policies.items():
-        spec = registry.task_spec(task)
-        for seed in seeds:
-            verdict = decentralised.verify(spec, agent.policy(spec, seed), job, worlds)
-            if not verdict.decentralised:
-                return "centralised", (f"{task}, training seed {seed}: {verdict}",)
+    for split, evaluation in _evaluations(view, threads=1).items():
+        job = evaluation.job(split, salt, agent_seed_key)
+        worlds = next(job.batches())
+        for task, seeds in view.entry.policies.items():
+            spec = registry.task_spec(task)
+            for seed in seeds:
+                verdict = decentralised.verify(spec, agent.policy(spec, seed), job, worlds)
+                if not verdict.decentralised:
+                    return "centralised", (f"{split}, {task}, training seed {seed}: {verdict}",)
     return "decentralised", ()
 
 
 def _outcome(entry: Entry, source: Source, seen: _Comparison) -> tuple[Outcome, tuple[str, ...]]:
     """The badge, and why it is not the best one."""
     agent = source.agent
-    reasons: list[str] = []
+    compared = ("hidden/", *(f"{split}/" for split in seen.splits))
+    reasons = [
+        f"{path}: rows of a split that has no results" for path in entry.rows if not path.startswith(compared)
+    ]
     for task, seeds in entry.policies.items():
         if {seed: agent.fingerprint(task, seed) for seed in agent.train_seeds(task)} != seeds:
             reasons.append(f"{task}: the policies are not those that were entered")

@@ -31,7 +31,7 @@ from hipg_bench.learning.mappo import networks
 from hipg_bench.learning.networks import Actor, Critic
 from hipg_bench.learning.settings import Settings
 from hipg_bench.paths import replacing
-from hipg_bench.registry import family_of, make, task_spec
+from hipg_bench.registry import definition_of, make, task_spec
 from hipg_bench.spec import parse
 
 _MOST_WORLDS = 2048
@@ -120,7 +120,7 @@ def audit(
     env = make(settings.task, worlds, seed, weights=settings.weights)
     rows, dead_share = _visit(env, actor, moments)
     n = env.num_agents
-    alive = env.recall(rows, "health") > 0
+    alive = env.get_field("health", rows) > 0
     case, victim = np.nonzero(alive)
     forks = rows[case]
     for agent in range(n):
@@ -182,7 +182,7 @@ def load(path: Path) -> tuple[Actor, Critic, Settings]:
         spec = task_spec(settings.task)
         if ":" in settings.algorithm:  # finding it would run code that a file names
             raise HipgError(f"{path}: networks of own credit rules are not audited ({settings.algorithm})")
-        actor, critic = networks(settings, family_of(spec).layout, clips=spec.clip_actions)
+        actor, critic = networks(settings, definition_of(spec).layout, clips=spec.clip_actions)
         if type(critic) is not StateCritic:
             raise HipgError(
                 f"{path}: an audit needs a critic of the joint state (algorithm {settings.algorithm})"
@@ -214,14 +214,16 @@ def _networks(path: Path) -> tuple[dict[str, dict[str, Tensor]], str]:
     }, text
 
 
-def redraw_randomness(env: BatchEnv, rows: Float[np.ndarray, "X R"], chance: np.random.Generator) -> None:
-    """Redraw in place how much more each agent can take.
+def redraw_thresholds(
+    env: BatchEnv, rows: Float[np.ndarray, "X R"], chance: np.random.Generator
+) -> Float[np.ndarray, "X R"]:
+    """Return the rows with other hazard thresholds, drawn given that nobody who lives has died so far.
 
-    Toughness is exponential: given that the exposure so far killed nobody who lives, what is left of
-    it is exponential again.
+    Thresholds are exponential: what is left of one, given that the hazard so far killed nobody, is
+    exponential again.
     """
-    exposure = env.recall(rows, "exposure")
-    env.recall(rows, "toughness")[:] = exposure + chance.exponential(size=exposure.shape)
+    hazard = env.get_field("cumulative_hazard", rows)
+    return env.set_field(rows, "hazard_threshold", hazard + chance.exponential(size=hazard.shape))
 
 
 @torch.no_grad()
@@ -284,8 +286,7 @@ def _returns(
     if settings.bootstrap_truncation and settings.gamma < 1:
         horizon += math.ceil(math.log(_NEGLIGIBLE) / math.log(max(settings.gamma, 1e-9)))
     env = make(settings.task, len(rows), weights=settings.weights, horizon=horizon)
-    rows = rows.copy()
-    redraw_randomness(env, rows, chance)
+    rows = redraw_thresholds(env, rows, chance)
     step = env.load_rows(np.arange(len(rows)), rows)
     total, discount, running = np.zeros(len(rows)), 1.0, np.ones(len(rows), bool)
     for _ in range(horizon):

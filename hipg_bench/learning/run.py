@@ -176,9 +176,9 @@ def _train_alone(
     report: Callable[[int, Log], None] | None,
     track: tuple[str, ...],
 ) -> None:
-    _check_not_lost(out)
     if (out / RECORD).exists():
         _check_same_task(settings.task, out)
+        _check_unfinished(settings, out)
     else:
         write_text(out / RECORD, _record(settings, command, 0, 0.0))
     learner = new_learner(settings, out)
@@ -229,8 +229,28 @@ def _check_same_task(task: str, out: Path) -> None:
         before = read_record(out)
     except HipgError as error:
         raise ResumeError(f"{error}; choose another --out") from error
+    if before.settings.model_dump().get("task") != before.task:
+        raise ResumeError(f"{out / RECORD} is not of `hipg-bench train`: choose another --out")
     if before.task != task:
         raise ResumeError(f"{out} was trained on {before.task}, not {task}: choose another --out")
+
+
+def _check_unfinished(settings: AnySettings, out: Path) -> None:
+    """Refuse to begin again, over a record of somebody else's or a run whose checkpoint is gone.
+
+    Raises:
+        ResumeError: there is no checkpoint, and the record is not that of the same run.
+    """
+    if (out / "checkpoint.pt").exists():
+        return
+    _check_not_lost(out)
+    wanted = json.loads(json.dumps(settings.model_dump()))
+    before = read_record(out).settings.model_dump()
+    if {**before, "steps": 0} != {**wanted, "steps": 0}:
+        raise ResumeError(
+            f"{out / RECORD} is of a run with other settings and there is no checkpoint.pt: nothing is "
+            f"overwritten; choose another --out"
+        )
 
 
 def _check_not_lost(out: Path) -> None:

@@ -12,6 +12,7 @@ import pydantic
 
 from hipg_bench.documents import read_toml
 from hipg_bench.errors import ResumeError, SpecError, hint
+from hipg_bench.families.known import declared, lineage
 from hipg_bench.registry import task_spec
 from hipg_bench.spec import Params, parse
 
@@ -336,9 +337,13 @@ def _preset(name: str, task: str, changes: Mapping[str, Any]) -> AnySettings:
     kind = settings_type(algorithm)
     tables = read_settings(Path(__file__).parent / "presets" / f"{name}.toml").get(kind.learner, {})
     values: dict[str, Any] = {"task": task, "eval_every": _EPISODES_PER_EVALUATION * spec.horizon}
+    by_family = tables.get("family", {})
+    shared = next((by_family[each] for each in lineage(spec.family) if each in by_family), {})
+    own = (declared(spec.family, "SETTINGS") or {}) if name == "recommended" else {}
     for table in (
         tables.get("all", {}),
-        tables.get("family", {}).get(spec.family, {}),
+        shared,
+        own.get(algorithm, {}),
         tables.get("algorithm", {}).get(algorithm, {}),
         tables.get("task", {}).get(task, {}),
     ):

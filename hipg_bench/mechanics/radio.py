@@ -1,39 +1,31 @@
-"""Who reaches whom over radio links, and by how many of them."""
+"""Who reaches whom over radio links, and by how many of them: plain functions of one world."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from jaxtyping import Bool, Int8
+from jaxtyping import Bool, Int
 
 
-def hops(links: Bool[np.ndarray, "M M B"], sources: Sequence[int]) -> Int8[np.ndarray, "S M B"]:
-    """Fewest links from each of S sources to every node; 0 to itself, -1 where there is no way.
-
-    The loop is over hops: it ends when no world's set of reached nodes grows, after at most M rounds.
+def count_hops(
+    links: Bool[np.ndarray, "M M"], source: int, hops: Int[np.ndarray, "M"], queue: Int[np.ndarray, "M"]
+) -> None:
+    """Count the fewest links from a source to every node, breadth first.
 
     Args:
-        links: symmetric adjacency of M nodes, at most 64; worlds last.
-        sources: the nodes to start from.
+        links: symmetric adjacency of M nodes.
+        source: the node to start from.
+        hops: written into; 0 to the source itself, -1 where there is no way.
+        queue: room to note the nodes that were reached, in order.
     """
-    nodes, _, worlds = links.shape
-    # a set of nodes is one word, node j its bit j: a link into the set is then a common bit
-    word = np.uint32 if nodes <= 32 else np.uint64
-    bit = word(1) << np.arange(nodes, dtype=word)
-    heard = np.einsum("ijb,j->ib", links, bit)
-    inside = np.zeros((len(sources), nodes, worlds), bool)
-    inside[np.arange(len(sources)), sources] = True
-    count = np.zeros(inside.shape, np.int8)
-    while True:
-        reached = np.bitwise_or.reduce(inside * bit[:, None], axis=1, keepdims=True)
-        further = inside | ((heard & reached) != 0)
-        if (further == inside).all():
-            return np.where(inside, count, np.int8(-1))
-        count += ~inside
-        inside = further
-
-
-def reachable(links: Bool[np.ndarray, "B M M"], source: int) -> Bool[np.ndarray, "B M"]:
-    """Nodes connected to node ``source`` over any number of links, itself included; worlds first."""
-    return hops(np.moveaxis(links, 0, -1), [source])[0].T >= 0
+    nodes, count, spread = len(links), 1, 0
+    for node in range(nodes):
+        hops[node] = -1
+    hops[source], queue[0] = 0, source
+    while spread < count:
+        here = queue[spread]
+        spread += 1
+        for node in range(nodes):
+            if links[here, node] and hops[node] < 0:
+                hops[node] = hops[here] + 1
+                queue[count] = node
+                count += 1

@@ -85,13 +85,13 @@ class AttentionSpec(NetworkSpec):
         """
         made: dict[str, Group] = {}
         for group in groups:
-            blocks = tuple(block.name for block in layout.blocks if block.name.startswith(f"{group}_"))
+            blocks = tuple(block.name for block in layout.present if block.name.startswith(f"{group}_"))
             if not blocks:
-                starts = {block.name.partition("_")[0] for block in layout.blocks}
+                starts = {block.name.partition("_")[0] for block in layout.present}
                 raise BundleError(f"no blocks {group + '_...'!r} in the observation{hint(group, starts)}")
             present = next((name for name in blocks if name.endswith(("_seen", "_there"))), None)
             made[group] = Group(blocks=blocks, present=present)
-        observation = tuple((block.name, block.shape) for block in layout.blocks)
+        observation = tuple((block.name, block.shape) for block in layout.present)
         return cls(observation=observation, groups=made, **spec)
 
     @property

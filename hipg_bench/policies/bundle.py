@@ -30,7 +30,7 @@ from hipg_bench.spec import TaskSpec
 
 
 def _action_size(spec: TaskSpec) -> int:
-    return registry.family_of(spec).layout.action.size
+    return registry.definition_of(spec).layout.action.size
 
 
 _SEED_FILE = re.compile(r"seed(0|[1-9][0-9]{0,8})")
@@ -172,7 +172,7 @@ class Agent:
 
     def _network(self, spec: TaskSpec, train_seed: int) -> Policy:
         network = load_network(self._weights(spec.task, train_seed))
-        layout = registry.family_of(spec).layout
+        layout = registry.definition_of(spec).layout
         sizes, expected = (
             (network.observation_size, network.action_size),
             (layout.observation.size, layout.action.size),
@@ -181,7 +181,7 @@ class Agent:
             raise BundleError(
                 f"agent {self.name!r}: {spec.task} has (O, A) = {expected}, its network {sizes}: train again"
             )
-        blocks = tuple((block.name, block.shape) for block in layout.observation.blocks)
+        blocks = tuple((block.name, block.shape) for block in layout.observation.present)
         if isinstance(network, Attention) and network.spec.observation != blocks:
             raise BundleError(
                 f"agent {self.name!r}: {spec.task} shows the blocks {_listed(blocks)}, "

@@ -86,7 +86,7 @@ class ForeignPolicy:
         self._budget = budget
         self._playing: weakref.WeakSet[Child] = weakref.WeakSet()
         self._next: Child | None = None
-        self._action_size = registry.family_of(spec).layout.action.size
+        self._action_size = registry.definition_of(spec).layout.action.size
         self._setup = told(spec, train_seed, runner, options)
 
     def initial_state(self, seed: int, episode_id: Int[np.ndarray, "B"], num_agents: int) -> Session:
@@ -157,7 +157,7 @@ class ForeignPolicy:
 
 def told(spec: TaskSpec, train_seed: int, runner: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """What a child is told: which module of `sandbox.inside` runs, and which task it is for."""
-    layout = registry.family_of(spec).layout
+    layout = registry.definition_of(spec).layout
     return {
         "runner": runner,
         "options": dict(options),
@@ -204,5 +204,5 @@ def _blocks(layout: Layout) -> list[dict[str, Any]]:
     """The layout as the agent is told it."""
     return [
         {"name": block.name, "shape": block.shape, "unit": block.unit, "frame": block.frame}
-        for block in layout.blocks
+        for block in layout.present
     ]

@@ -6,23 +6,38 @@ the gap between the aware and the hazard-unaware expert is its hazard sensitivit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from hipg_bench.errors import UnknownNameError, hint
+from hipg_bench.errors import UnknownNameError
+from hipg_bench.families.known import declared, lineage
 from hipg_bench.layout import TaskLayout
-from hipg_bench.registry import family_of
+from hipg_bench.registry import definition_of
 from hipg_bench.spec import TaskSpec
 
 _CLEARANCE = 0.04
 """How far outside a hazard's radius the aware expert stays, m."""
-_DRONE, _PARTICLE = (6.0, 1.33), (50.0, 7.5)
-"""Action per m to go, and per m/s of speed; a drone (6 N of thrust, 4 N s/m of drag) is critically damped."""
 
 Places = Float[np.ndarray, "B N D"]  # D is 3 for drones, 2 for the paper's particles
+
+
+@dataclasses.dataclass(frozen=True)
+class Expert:
+    """What a family declares as its ``EXPERT``.
+
+    Attributes:
+        plan: where agents are to go, from (spec, layout, state, alive, blind).
+        stiffness: action per m to go.
+        damping: action per m/s of speed.
+    """
+
+    plan: Callable[..., Places]
+    stiffness: float
+    damping: float
 
 
 class Scripted:
@@ -40,14 +55,14 @@ class Scripted:
         Raises:
             UnknownNameError: nobody has written an expert for that family.
         """
-        if spec.family not in _PLANS:
-            raise UnknownNameError(
-                f"no scripted expert for family {spec.family!r}{hint(spec.family, _PLANS)}"
-            )
+        expert: Expert | None = declared(spec.family, "EXPERT")
+        if expert is None:
+            raise UnknownNameError(f"{spec.task}: family {spec.family!r} declares no scripted EXPERT")
+        self._expert = expert
         self._spec = spec
         # a hazard that cannot kill is no reason to keep away
         self._blind = blind or spec.params["hazard_peak"] == 0
-        self._layout = family_of(spec).layout
+        self._layout = definition_of(spec).layout
 
     def initial_state(self, seed: int, episode_id: Int[np.ndarray, "B"], num_agents: int) -> None:
         """Remember nothing: the state says it all."""
@@ -56,12 +71,11 @@ class Scripted:
         self, state: Float[np.ndarray, "B S"], memory: None, alive: Bool[np.ndarray, "B N"]
     ) -> tuple[Float[np.ndarray, "B N A"], None]:
         """Fly every live drone towards its place in the plan."""
-        plan, (stiffness, damping) = _PLANS[self._spec.family]
         state = state.astype(np.float64)
-        target = plan(self._spec, self._layout, state, alive, self._blind)
+        target = self._expert.plan(self._spec, self._layout, state, alive, self._blind)
         position = self._layout.state.view(state, "position")
         velocity = self._layout.state.view(state, "velocity")
-        action = stiffness * (target - position) - damping * velocity
+        action = self._expert.stiffness * (target - position) - self._expert.damping * velocity
         return (np.clip(action, -1.0, 1.0) if self._spec.clip_actions else action), memory
 
 
@@ -81,7 +95,7 @@ def _navigate(
     margin = spec.params["hazard_radius"] + _CLEARANCE
     # hazards that do not exist are put where nobody passes
     hazard = np.where(hazardous[..., None], point, 1e3)
-    if spec.family == "paper_nav":
+    if "paper_nav" in lineage(spec.family):
         point = np.where(hazardous[..., None], np.nan, point)
     target = _outside(_assign(position, point, alive), hazard, margin, towards=position)
     return _around(position, target, hazard, margin)
@@ -106,13 +120,9 @@ def _relay(
     return target if blind else _around(position, target, hazard[:, None], margin)
 
 
-_PLANS: Mapping[str, tuple[Callable[..., Places], tuple[float, float]]] = {
-    "hazard_nav": (_navigate, _DRONE),
-    "hazard_comm": (_relay, _DRONE),
-    "paper_nav": (_navigate, _PARTICLE),
-    "paper_comm": (_relay, _PARTICLE),
-}
-"""Where a family's agents are to go, and how its bodies are steered there."""
+DRONES_NAVIGATION, DRONES_RELAY = Expert(_navigate, 6.0, 1.33), Expert(_relay, 6.0, 1.33)
+"""Drones with 6 N of thrust and 4 N s/m of drag are critically damped."""
+PARTICLES_NAVIGATION, PARTICLES_RELAY = Expert(_navigate, 50.0, 7.5), Expert(_relay, 50.0, 7.5)
 
 
 def _assign(position: Places, target: Float[np.ndarray, "B P D"], alive: Bool[np.ndarray, "B N"]) -> Places:

@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hipg_bench.families.paper_comm import PaperComm
-from hipg_bench.mechanics import radio
+from hipg_bench.mechanics.radio import count_hops
 from hipg_bench.rendering import palette
 from hipg_bench.rendering.agents import AgentVisuals
 from hipg_bench.rendering.camera import FIELD_OF_VIEW, Camera
@@ -169,17 +168,13 @@ class Communication(Drones):
 
     def __init__(self, trajectory: Trajectory, visuals: AgentVisuals) -> None:
         super().__init__(trajectory, visuals)
-        family = trajectory.family
         # in the paper's tasks the range follows from the team's size
-        self._range = (
-            family.link_range
-            if isinstance(family, PaperComm)
-            else float(trajectory.spec.params["link_range"])
-        )
+        definition = trajectory.definition
+        self._range = float(definition.family.numbers(trajectory.spec, definition.params)["link_range"])
 
     def update(self, time: float) -> None:
         """Light the terminals' lamps."""
-        linked = bool(radio.reachable(self._links(time)[None], 0)[0, 1])
+        linked = bool(_reached(self._links(time))[1])
         for k in (0, 1):
             self.tint(f"terminal{k}/", np.asarray(palette.LINK if linked else WHITE), but=("collar", "spike"))
 
@@ -187,7 +182,7 @@ class Communication(Drones):
         """Draw arena, network and hazard."""
         self.draw_arena(painter, time)
         node, links = self._nodes, self._links(time)
-        reached = radio.reachable(links[None], 0)[0]
+        reached = _reached(links)
         linked = bool(reached[1])
         chain = _chain(links) if linked else []
         in_chain = {frozenset(pair) for pair in itertools.pairwise(chain)}
@@ -245,6 +240,13 @@ def _draw_mast(painter: Painter, place: np.ndarray, colour: tuple[float, ...]) -
     for angle in (0.0, 2.094, 4.189):
         spread = 0.10 * (np.cos(angle) * _X + np.sin(angle) * _Y)
         painter.line(foot + spread, foot + 0.45 * (place - foot), 0.004, _STEEL, glow=0.1)
+
+
+def _reached(links: Bool[np.ndarray, "M M"]) -> Bool[np.ndarray, "M"]:
+    """Nodes to which there is a way from node 0."""
+    hops, queue = np.empty((2, len(links)), np.int64)
+    count_hops(links, 0, hops, queue)
+    return hops >= 0
 
 
 def _chain(links: Bool[np.ndarray, "M M"]) -> list[int]:

@@ -236,7 +236,7 @@ def _frames(job: Job, rows: Float[np.ndarray, "K R"]) -> Iterator[tuple[bytes, i
     # while a view is painted, the next one is composed and the one before is written on and encoded
     for view, frame in ahead(painted(ahead(views(scene, times.tolist(), job.height)))):
         now = trajectory.remembered(view.time)
-        reading = Reading(view.time, float(now["return"][0]), now["health"], view.status)
+        reading = Reading(view.time, float(now["episode_return"]), now["health"], view.status)
         picture = hud.write(frame, view.camera, view.labels, reading)
         yield picture.tobytes(), total
     headline, lines = _ending(job, trajectory.remembered(trajectory.time[-1]))
@@ -256,12 +256,12 @@ def ahead(items: Iterator[T]) -> Iterator[T]:
 
 def _ending(job: Job, end: Mapping[str, np.ndarray]) -> tuple[str, tuple[str, str]]:
     """What the end card says."""
-    finished = end["elapsed"][0] >= job.spec.horizon
+    finished = end["elapsed"] >= job.spec.horizon
     reason = job.end_reason or ("horizon" if finished else "")
     headline = _ENDS.get(reason, reason) or "the episode is over"
     alive = int((end["health"] > 0).sum())
     return headline[0].upper() + headline[1:], (
-        f"team return {float(end['return'][0]):.1f}",
+        f"team return {float(end['episode_return']):.1f}",
         f"{alive} of {job.spec.num_agents} agents alive",
     )
 

@@ -222,7 +222,7 @@ def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
     with Renderer(trajectory.model, *SIZE) as renderer:
         for view in views(scene, latest(), SIZE[1]):
             now = trajectory.remembered(view.time)
-            reading = Reading(view.time, float(now["return"][0]), now["health"], view.status)
+            reading = Reading(view.time, float(now["episode_return"]), now["health"], view.status)
             frame = renderer.render(view.mjv_scene)
             out.write(hud.write(frame, view.camera, view.labels, reading).tobytes())
             out.flush()

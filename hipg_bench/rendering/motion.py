@@ -15,10 +15,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from hipg_bench.env import memory_fields, world_model
+from hipg_bench.env import world_model
 from hipg_bench.errors import RenderError
-from hipg_bench.registry import family_of
+from hipg_bench.registry import definition_of
+from hipg_bench.sim import columns
 from hipg_bench.spec import TaskSpec
+from hipg_bench.stepper import row_type
 
 _STATE = mujoco.mjtState
 _COARSE = 0.05
@@ -32,13 +34,13 @@ class Trajectory:
 
     Attributes:
         spec: the task.
-        family: its rules.
+        definition: what its family says.
         model: compiled with visuals.
         data: the world as `show` last left it.
         rows: (K, R) of one episode, in order.
         body_position: (K, nbody, 3) where every body was at each row, m.
         time: (K,) seconds since the episode began.
-        field: name to (K, size), what the episode remembered at each row.
+        field: name to (K, *axes), what the world held at each row.
     """
 
     def __init__(self, spec: TaskSpec, rows: Float[np.ndarray, "K R"]) -> None:
@@ -47,10 +49,10 @@ class Trajectory:
         Raises:
             RenderError: rows of another task, or not finite.
         """
-        family = family_of(spec)
         self.spec = spec
-        self.family = family
-        self.model = world_model(spec, family, visual=True)
+        self.definition = definition_of(spec)
+        self.model = world_model(self.definition, visual=True)
+        self._row_type = row_type(self.definition, self.model)
         self.data = mujoco.MjData(self.model)
         self.size = mujoco.mj_stateSize(self.model, _STATE.mjSTATE_INTEGRATION)
         self._scratch = mujoco.MjData(self.model)
@@ -83,7 +85,7 @@ class Trajectory:
         """Keep rows, and forget what was derived from others."""
         self.rows, self.body_position = rows, places
         self.field = self._fields(rows)
-        self.time = self.field["elapsed"][:, 0] * self.spec.control_step
+        self.time = self.field["elapsed"] * self.spec.control_step
         for name in ("lifetime", "acceleration"):
             self.__dict__.pop(name, None)
 
@@ -176,15 +178,11 @@ class Trajectory:
 
     def _part(self, name: str) -> Float[np.ndarray, "K size"]:
         """Columns of the rows that hold one component of the integration state."""
-        return _columns(self.model, self.rows, name)
+        return self.rows[:, columns(self.model, name)]
 
     def _fields(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        sizes = memory_fields(self.spec, self.family)
-        ends = np.cumsum(list(sizes.values())).tolist()
-        userdata = _columns(self.model, rows, "USERDATA")
-        return {
-            name: userdata[:, end - size : end] for (name, size), end in zip(sizes.items(), ends, strict=True)
-        }
+        worlds = np.ascontiguousarray(rows, np.float64).view(self._row_type)[:, 0]
+        return {name: worlds[name] for name in self._row_type.names or ()}
 
     def _between(self, before: int, after: int, share: float, step: float) -> Float[np.ndarray, "nq"]:
         """Generalised coordinates between two rows."""
@@ -232,16 +230,9 @@ class _Joints:
     quaternion: tuple[slice, ...]
 
 
-def _columns(model: mujoco.MjModel, rows: np.ndarray, name: str) -> np.ndarray:
-    """Components of a state row lie in the order of their bits."""
-    bit = int(getattr(_STATE, f"mjSTATE_{name}"))
-    start = mujoco.mj_stateSize(model, int(_STATE.mjSTATE_INTEGRATION) & (bit - 1))
-    return rows[:, start : start + mujoco.mj_stateSize(model, bit)]
-
-
 def _first_episode(field: Mapping[str, np.ndarray]) -> slice:
     """The rows up to where another episode begins."""
-    elapsed, episode = field["elapsed"][:, 0], field["episode_id"][:, 0]
+    elapsed, episode = field["elapsed"], field["episode_id"]
     other = (episode[1:] != episode[:-1]) | (elapsed[1:] <= elapsed[:-1])
     return slice(0, int(other.argmax()) + 1 if other.any() else len(elapsed))
 

@@ -5,26 +5,17 @@ A stranger should see at a glance who is alive, what is dangerous and what is li
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import mujoco
 
-from hipg_bench.errors import RenderError, hint
-from hipg_bench.rendering import drones, walkers
+from hipg_bench.errors import RenderError
+from hipg_bench.families.known import declared
 from hipg_bench.rendering.agents import AgentVisuals
 from hipg_bench.rendering.camera import Camera
 from hipg_bench.rendering.look import Look, Status, mark_agents
 from hipg_bench.rendering.motion import Trajectory
 from hipg_bench.rendering.painter import Label, Painter
-
-LOOKS: Mapping[str, Callable[[Trajectory, AgentVisuals], Look]] = {
-    "hazard_nav": drones.Navigation,
-    "hazard_comm": drones.Communication,
-    "paper_nav": drones.Navigation,
-    "paper_comm": drones.Communication,
-    "multiwalker": walkers.Carrying,
-}
-"""Family to how it is shown."""
 
 
 class Scene:
@@ -44,11 +35,12 @@ class Scene:
             RenderError: nobody has said how the family looks.
         """
         family = trajectory.spec.family
-        if family not in LOOKS:
-            raise RenderError(f"{trajectory.spec.task}: no look for family {family!r}{hint(family, LOOKS)}")
+        style: Callable[[Trajectory, AgentVisuals], Look] | None = declared(family, "RENDERING")
+        if style is None:
+            raise RenderError(f"{trajectory.spec.task}: family {family!r} declares no RENDERING")
         self.trajectory = trajectory
         self.visuals = AgentVisuals(trajectory)
-        self._look = LOOKS[family](trajectory, self.visuals)
+        self._look = style(trajectory, self.visuals)
         self.legend = self._look.legend
         self.travels = self._look.travels
         # shadows are computed within a square around the camera's target

@@ -91,7 +91,7 @@ def _draw(window: mujoco.viewer.Handle, scene: Scene, moment: float) -> None:
     alive = int((now["health"] > 0).sum())
     words = {
         "time": f"{moment:.1f} s",
-        "return": f"{float(now['return'][0]):.1f}",
+        "return": f"{float(now['episode_return']):.1f}",
         "alive": f"{alive} of {scene.trajectory.num_agents}",
         **{line.text: "" for line in status},
     }

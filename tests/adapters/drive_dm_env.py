@@ -4,7 +4,7 @@ import numpy as np
 from drivers import Seen
 
 from hipg_bench.adapters.dm_env import load
-from hipg_bench.registry import family_of
+from hipg_bench.registry import definition_of
 
 
 class Lists:
@@ -14,7 +14,7 @@ class Lists:
     def __init__(self, task, seed, **overrides):
         self.names, self.numbers = task.rsplit("-", 1), overrides
         self.env = self.load(seed)
-        layout = family_of(self.env.spec).layout
+        layout = definition_of(self.env.spec).layout
         self.health, self.dead_value = layout.health_block, layout.dead_value
 
     def load(self, seed):

@@ -119,8 +119,8 @@ def test_observations_are_the_blocks_of_the_layout_by_name(task):
     joint = HipgEnvironment(task, 2, joint=True).reset().observation
     assert len(shown) == world.num_agents
     for agent, seen in enumerate(shown):
-        assert list(seen) == [block.name for block in layout.blocks]
-        for block in layout.blocks:
+        assert list(seen) == [block.name for block in layout.present]
+        for block in layout.present:
             np.testing.assert_array_equal(seen[block.name], layout.view(flat, block.name)[agent])
             np.testing.assert_array_equal(seen[block.name], joint[block.name][agent])
 

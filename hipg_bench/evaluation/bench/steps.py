@@ -78,7 +78,7 @@ def stepping(spec: TaskSpec, num_envs: int, threads: int) -> tuple[BatchEnv, Con
     env.reset()
     rows = env.rows
     # endings and their resets are then spread over the horizon, as they are in a long run
-    env.recall(rows, "elapsed")[:, 0] = np.arange(num_envs) * spec.horizon // num_envs
+    rows = env.set_field(rows, "elapsed", np.arange(num_envs) * spec.horizon // num_envs)
     env.load_rows(np.arange(num_envs), rows)
     chance = np.random.default_rng(0)
     actions = itertools.cycle(chance.uniform(-1, 1, (_POOL, num_envs, env.num_agents, env.action_size)))

@@ -69,19 +69,41 @@ class LivingCritic(RolloutCritic):
         return torch.cat([self.team_value(seen, alive)[:, None], self.baselines(seen, action, alive)], dim=1)
 
     def team_value(self, seen: Float[Tensor, "*B N I"], alive: Bool[Tensor, "*B N"]) -> Float[Tensor, "*B"]:
-        """V of the living agents' observations."""
-        return self._read(self._activation(self.embed(seen)), alive)
+        """V of the living agents' observations; 0 where nobody lives."""
+        token = self._activation(self.embed(seen))
+        query, key, value = self.attention(token).chunk(3, dim=-1)
+        somebody = alive.any(-1)
+        # a row without a finite fit would be NaN
+        share = _softmax(query @ key.mT, (alive | ~somebody[..., None])[..., None, :], token.shape[-1])
+        weight = alive.float() / alive.sum(-1, keepdim=True).clamp(min=1)
+        pooled = (weight[..., None] * (token + share @ value)).sum(-2)
+        return self.head(pooled)[..., 0] * somebody
 
     def baselines(
         self, seen: Float[Tensor, "X N I"], action: Float[Tensor, "X N A"], alive: Bool[Tensor, "X N"]
     ) -> Float[Tensor, "X N"]:
-        """For each agent j: of its observation, and of the others' observations and actions."""
-        n = seen.shape[1]
+        """For each agent j: of its observation, and of the others' observations and actions.
+
+        The sets of two agents differ by two embeddings only. So queries, keys and values are made once of
+        every agent's embedding with and without its action, fits [j, i, k] are put together from theirs, and
+        what the queries i get is averaged before values are mixed: nothing of size N * N * D is made.
+        """
         own = self._activation(self.embed(seen))
         acting = self._activation(self.embed_acting(torch.cat([seen, action], dim=-1)))
-        mine = torch.eye(n, dtype=torch.bool)[..., None]
-        token = torch.where(mine, own[:, None], acting[:, None])  # (X, j, N, D)
-        return self._read(token, (alive[:, None] | mine[..., 0]).expand(-1, n, n))
+        own_query, own_key, own_value = self.attention(own).chunk(3, dim=-1)
+        query, key, value = self.attention(acting).chunk(3, dim=-1)
+        mine = torch.eye(seen.shape[1], dtype=torch.bool)
+        asks, asked = mine[:, :, None], mine[:, None, :]  # i is j, k is j
+        fit = torch.where(asked, (query @ own_key.mT).mT[:, :, :, None], (query @ key.mT)[:, None])
+        of_own = torch.where(mine, (own_query * own_key).sum(-1)[:, :, None], own_query @ key.mT)
+        fit = torch.where(asks, of_own[:, :, None, :], fit)
+        there = alive[:, None] | mine
+        share = _softmax(fit, there[:, :, None, :], own.shape[-1])
+        weight = there.float() / there.sum(-1, keepdim=True)
+        mix = (weight[..., None] * share).sum(2)  # what k gives to j's mean
+        others = weight.masked_fill(mine, 0) @ acting + mix.masked_fill(mine, 0) @ value
+        self_weight, self_mix = (m.diagonal(dim1=1, dim2=2)[..., None] for m in (weight, mix))
+        return self.head(others + self_weight * own + self_mix * own_value)[..., 0]
 
     def tokens(
         self, observation: Float[Tensor, "*B N O"], elapsed: Float[Tensor, "*B"]
@@ -90,15 +112,12 @@ class LivingCritic(RolloutCritic):
         share = elapsed[..., None, None].expand(*observation.shape[:-1], 1)
         return torch.cat([self.norm(observation), share], dim=-1)
 
-    def _read(self, token: Float[Tensor, "*B N D"], there: Bool[Tensor, "*B N"]) -> Float[Tensor, "*B"]:
-        """Residual self-attention among those who are there, their mean, and the head; 0 for an empty set."""
-        query, key, value = self.attention(token).chunk(3, dim=-1)
-        fit = query @ key.mT / math.sqrt(token.shape[-1])
-        somebody = there.any(-1)
-        share = fit.masked_fill(~(there | ~somebody[..., None])[..., None, :], -torch.inf).softmax(-1)
-        weight = there.float() / there.sum(-1, keepdim=True).clamp(min=1)
-        pooled = (weight[..., None] * (token + share @ value)).sum(-2)
-        return self.head(pooled)[..., 0] * somebody
+
+def _softmax(
+    fit: Float[Tensor, "*X i k"], there: Bool[Tensor, "*X #i k"], size: int
+) -> Float[Tensor, "*X i k"]:
+    """Shares of the scaled fits of those who are there."""
+    return (fit / math.sqrt(size)).masked_fill(~there, -torch.inf).softmax(-1)
 
 
 @credit_rule(critic=LivingCritic, always_masks=True)

@@ -1,0 +1,34 @@
+"""A family of one's own: hazard navigation in which the team is charged for every drone that it loses.
+
+What is not said here it has from its parent: world, rules, observations, films, expert, evaluation splits.
+`try_it.py` registers it for one process. Installed (``pip install examples/careful_nav``), all know it:
+``hipg-bench train --task examples/careful_nav/careful_nav-5.toml``, and so for evaluate, video and calibrate.
+"""
+
+from __future__ import annotations
+
+from hipg_bench.families import hazard_nav
+from hipg_bench.families.family import Previous
+
+PARENT = "hazard_nav"
+
+
+class Terms(hazard_nav.Terms):
+    """Parts of the team reward, before weights."""
+
+    lost: float  # drones that died in the step
+
+
+def reward(
+    w: hazard_nav.World,
+    previous: Previous,
+    scratch: hazard_nav.Scratch,
+    task: hazard_nav.Numbers,
+    terms: Terms,
+) -> None:
+    """Charge for uncovered points, collisions and losses; the task file has the weights."""
+    hazard_nav.reward(w, previous, scratch, task, terms)
+    terms.lost = 0.0
+    for i in range(len(w.health)):
+        if w.health[i] == 0 and previous.health[i] > 0:
+            terms.lost += 1.0
