@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import html
+import pkgutil
 from collections.abc import Mapping
 from typing import Any, NoReturn, TypedDict
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from hipg_bench import episode
 from hipg_bench.arguments import MOST_EPISODE, MOST_SEED, numbers, whole
-from hipg_bench.errors import ActionError, HipgError, SpecError, UnknownNameError, hint
+from hipg_bench.errors import ActionError, HipgError, RenderError, SpecError, UnknownNameError, hint
 from hipg_bench.families.family import METRICS, NEVER, Definition
 from hipg_bench.families.scene import without_visuals
 from hipg_bench.layout import TaskLayout
@@ -31,6 +33,12 @@ def world_model(definition: Definition, *, visual: bool = False) -> mujoco.MjMod
         raise SpecError(
             f"{definition.spec.task}: MuJoCo refuses a world with these numbers: {said}"
         ) from error
+
+
+_PICTURES, _PNG = "hipg_bench.rendering.live:Stills", "hipg_bench.rendering.live:png"
+"""What draws worlds. It is named here and imported by the first picture: rendering is built on this module."""
+_PIXELS = 64, 4096
+"""Smallest and largest side of a picture."""
 
 
 class Info(TypedDict):
@@ -134,6 +142,7 @@ class BatchEnv:
         self._waiting = np.ones(num_envs, bool)
         self._any_waiting = True
         self._closed = False
+        self._pictures: Any = None
 
     def __getstate__(self) -> dict[str, Any]:
         """What pickle and deepcopy keep: how it was built, and the worlds as they are."""
@@ -336,9 +345,78 @@ class BatchEnv:
             rows = self.set_field(rows, name, value)
         return self.load_rows(ids, rows)
 
+    def render(
+        self, world: int = 0, width: int = 640, height: int = 360
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """A picture of a world as it stands, drawn in a child process; no display is needed.
+
+        Args:
+            world: in 0..B-1.
+            width, height: pixels, 64 to 4096 each.
+
+        Returns:
+            (height, width, 3) uint8; the same world gives the same picture.
+
+        Raises:
+            SpecError: no such world, or a size that is not allowed.
+            RenderError: no episode has begun, or no OpenGL works here.
+        """
+        self._check_open()
+        task = self.spec.task
+        world = whole(world, f"{task}: world", 0, self.num_envs - 1)
+        size = tuple(
+            whole(value, f"{task}: {name}", *_PIXELS)
+            for name, value in (("width", width), ("height", height))
+        )
+        if not self._begun:
+            raise RenderError(f"{task}: nothing to render before reset()")
+        if self._pictures is None:
+            self._pictures = pkgutil.resolve_name(_PICTURES)(self.spec)
+        return self._pictures.picture(self._stepper.sim.rows[world].copy(), size)
+
+    def __repr__(self) -> str:
+        """Task, sizes and seed, and where world 0 is."""
+        return f"<BatchEnv {', '.join(self._facts())}>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a picture of world 0 and the same facts; without OpenGL the facts only."""
+        told = html.escape(", ".join(self._facts()))
+        if not self._begun or self._closed:
+            return f"<div>{told}</div>"
+        try:
+            picture = self.render()
+        except RenderError as error:
+            return f"<div>{told}</div><div>no picture: {html.escape(str(error).splitlines()[0])}</div>"
+        png = pkgutil.resolve_name(_PNG)(picture)
+        return f'<img src="data:image/png;base64,{png}" width="400" alt="world 0"><div>{told}</div>'
+
+    def _facts(self) -> list[str]:
+        threads = self._stepper.sim.threads
+        if self._closed:
+            world = "closed"
+        elif not self._begun:
+            world = "not yet reset"
+        else:
+            first = self._stepper.worlds[0]
+            dead = int((first["health"] == 0).sum())
+            world = (
+                f"world 0: episode {first['episode_id']:.0f} after {first['elapsed']:.0f} steps, {dead} dead"
+            )
+        return [
+            self.spec.task,
+            f"num_envs={self.num_envs}",
+            f"{self.num_agents} agents",
+            f"seed={self._seed}",
+            "compiled" if self._options["compiled"] else "not compiled",
+            f"{threads} thread{'s' * (threads > 1)}",
+            world,
+        ]
+
     def close(self) -> None:
         """Refuse further use."""
         self._closed = True
+        if self._pictures is not None:
+            self._pictures.close()
 
     def _begin(self, ids: Int[np.ndarray, "n"], episodes: Int[np.ndarray, "n"]) -> None:
         """Start episodes in worlds ``ids``: all random numbers of an episode are drawn here."""

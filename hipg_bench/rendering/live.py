@@ -1,4 +1,4 @@
-"""One world shown while it is played: a picture when asked, or a window.
+"""Worlds shown while they are played: a picture when asked, or a window.
 
 OpenGL lives in a child process, which is this module, ``python -m hipg_bench.rendering.live``: it can choose
 its backend whatever the process that plays has imported, and a broken driver cannot take that down. Rows go
@@ -8,7 +8,9 @@ picture's bytes, or one byte when the window takes a row.
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import io
 import itertools
 import os
 import select
@@ -43,11 +45,13 @@ class Job(Params):
 
     Attributes:
         spec: the task.
-        mode: what to show.
+        mode: a window, a picture of an episode up to now, or a picture of one row by itself.
+        size: width and height of pictures.
     """
 
     spec: TaskSpec
-    mode: Literal["human", "rgb_array"]
+    mode: Literal["human", "rgb_array", "still"]
+    size: tuple[int, int] = SIZE
 
 
 class Live:
@@ -125,6 +129,56 @@ class Live:
             raise
 
 
+class Stills:
+    """Pictures of single rows, each by itself: the same row gives the same picture."""
+
+    def __init__(self, spec: TaskSpec) -> None:
+        """Prepare, without OpenGL as yet."""
+        self._spec = spec
+        self._child: _Child | None = None
+        self._size = SIZE
+        self._lock = threading.Lock()
+
+    def picture(
+        self, row: Float[np.ndarray, "R"], size: tuple[int, int] = SIZE
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """The world that a row holds; width and height in pixels.
+
+        Raises:
+            RenderError: no OpenGL works here, or the child failed.
+        """
+        with self._lock:
+            if self._child and self._child.parent != os.getpid():
+                self._child.end.detach()
+                self._child = None
+            if self._size != size:
+                self.close()
+            if self._child is None:
+                self._child = _Child(Job(spec=self._spec, mode="still", size=size))
+                self._size = size
+            try:
+                pixels = self._child.ask(_HEAD.pack(1, len(row)) + row.tobytes(), size[0] * size[1] * 3)
+            except BaseException:
+                self.close()  # a late answer would be taken for the next one
+                raise
+            return np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).copy()
+
+    def close(self) -> None:
+        """End the child."""
+        if self._child:
+            self._child.end()
+        self._child = None
+
+
+def png(picture: UInt8[np.ndarray, "height width 3"]) -> str:
+    """A picture as base64 of a PNG file, for a page."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "png")
+    return base64.b64encode(file.getvalue()).decode()
+
+
 class _Child:
     """The process that draws, as seen by the one that plays; it ends with this object."""
 
@@ -198,7 +252,7 @@ def _messages() -> Iterator[Float[np.ndarray, "k R"]]:
         yield np.frombuffer(sys.stdin.buffer.read(count * size * 8)).reshape(count, size)
 
 
-def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
+def _draw(job: Job, out: IO[bytes]) -> None:
     """Answer each message with a picture, written on as in films."""
     # graphics are touched here and in the child only
     from hipg_bench.rendering.hud import Caption, Hud, Reading
@@ -208,19 +262,23 @@ def _draw(spec: TaskSpec, out: IO[bytes]) -> None:
 
     messages = _messages()
     first = next(messages)
+    spec = job.spec
     trajectory = Trajectory(spec, first[:1])
     scene = Scene(trajectory)
     duration = spec.horizon * spec.control_step
-    hud = Hud(Caption(spec.task, "", scene.legend, 1.0, duration, scene.visuals.colour), *SIZE)
+    hud = Hud(Caption(spec.task, "", scene.legend, 1.0, duration, scene.visuals.colour), *job.size)
 
     def latest() -> Iterator[float]:
         for rows in itertools.chain([first[1:]], messages):
             for row in rows:
-                trajectory.append(row)
+                if job.mode == "still":
+                    trajectory.load(row[None])
+                else:
+                    trajectory.append(row)
             yield float(trajectory.time[-1])
 
-    with Renderer(trajectory.model, *SIZE) as renderer:
-        for view in views(scene, latest(), SIZE[1]):
+    with Renderer(trajectory.model, *job.size) as renderer:
+        for view in views(scene, latest(), job.size[1]):
             now = trajectory.remembered(view.time)
             reading = Reading(view.time, float(now["episode_return"]), now["health"], view.status)
             frame = renderer.render(view.mjv_scene)
@@ -242,12 +300,12 @@ def _main() -> None:
     # what libraries print must not get between the answers
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    if job.mode == "rgb_array":
-        _draw(job.spec, out)
-    else:
+    if job.mode == "human":
         from hipg_bench.rendering.viewer import watch
 
         watch(job.spec, _taken(out))
+    else:
+        _draw(job, out)
 
 
 if __name__ == "__main__":

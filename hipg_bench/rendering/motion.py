@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from hipg_bench.env import world_model
 from hipg_bench.errors import RenderError
+from hipg_bench.families.family import NEVER
 from hipg_bench.registry import definition_of
 from hipg_bench.sim import columns
 from hipg_bench.spec import TaskSpec
@@ -27,6 +28,8 @@ _COARSE = 0.05
 """Control steps longer than this are interpolated with velocities, s; shorter ones by straight lines."""
 _LEAN_WINDOW = 0.15
 """Standard deviation of the smoothing of accelerations that drones lean into, s."""
+_AFTERMATH = 0.5
+"""Until a dead agent is dark and the flash of its death is over, s."""
 
 
 class Trajectory:
@@ -96,9 +99,17 @@ class Trajectory:
 
     @functools.cached_property
     def lifetime(self) -> Float[np.ndarray, "N"]:
-        """When each agent's health reached 0, s; inf for those alive in the last row."""
+        """When each agent's health reached 0, s; inf for those alive in the last row.
+
+        Where the rows begin after that, or hold a health that somebody set, the episode tells when. A single
+        row shows the dead as they look some time later.
+        """
         dead = self.field["health"] == 0
-        first = self.time[dead.argmax(axis=0)]
+        seen = self.time[dead.argmax(axis=0)]
+        if len(self.rows) == 1:
+            seen = seen - _AFTERMATH
+        died = self.field["death_time"][-1] * self.spec.control_step
+        first = np.where(self.field["death_time"][-1] == NEVER, seen, np.minimum(seen, died))
         return np.where(dead.any(axis=0), first, np.inf)
 
     def since(self, name: str, time: float) -> Float[np.ndarray, "size"]:

@@ -64,8 +64,9 @@ class Carrying:
 
     @property
     def _start(self) -> np.ndarray:
-        """Where the plank was in the first row, m."""
-        return self._trajectory.body_position[0, self._plank]
+        """Where the plank was when the episode began, m."""
+        gone = np.array([float(self._trajectory.field["displacement"][0]), 0.0, 0.0])
+        return self._trajectory.body_position[0, self._plank] - gone
 
     @property
     def _way(self) -> np.ndarray:
