@@ -36,7 +36,7 @@ def world_model(definition: Definition, *, visual: bool = False) -> mujoco.MjMod
 
 
 _PICTURES, _PNG = "hipg_bench.rendering.live:Stills", "hipg_bench.rendering.live:png"
-"""What draws worlds. It is named here and imported by the first picture: rendering is built on this module."""
+"""What draws worlds: named here and imported by the first picture, as rendering is built on this module."""
 _PIXELS = 64, 4096
 """Smallest and largest side of a picture."""
 
@@ -352,7 +352,8 @@ class BatchEnv:
 
         Args:
             world: in 0..B-1.
-            width, height: pixels, 64 to 4096 each.
+            width: in pixels, 64 to 4096.
+            height: in pixels, 64 to 4096.
 
         Returns:
             (height, width, 3) uint8; the same world gives the same picture.
@@ -364,10 +365,7 @@ class BatchEnv:
         self._check_open()
         task = self.spec.task
         world = whole(world, f"{task}: world", 0, self.num_envs - 1)
-        size = tuple(
-            whole(value, f"{task}: {name}", *_PIXELS)
-            for name, value in (("width", width), ("height", height))
-        )
+        size = whole(width, f"{task}: width", *_PIXELS), whole(height, f"{task}: height", *_PIXELS)
         if not self._begun:
             raise RenderError(f"{task}: nothing to render before reset()")
         if self._pictures is None:

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
@@ -89,8 +90,6 @@ def test_the_plank_of_a_single_picture_has_gone_as_far_as_in_the_world():
     trajectory = Trajectory(env.spec, env.rows)
     scene = Scene(trajectory)
     scene.update(0.0)
-    import mujoco
-
     painter = Painter(mujoco.MjvScene(trajectory.model, 4000), scene.camera(0.0), 360)
     said = [status.text for status in scene._look.decorate(painter, 0.0)]
     assert said == ["plank +2.50 m", "3 of 3 on their feet"]
