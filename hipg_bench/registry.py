@@ -12,7 +12,7 @@ from hipg_bench import spec as specs
 from hipg_bench.arguments import seed_or_entropy, whole
 from hipg_bench.env import BatchEnv
 from hipg_bench.errors import SpecError, UnknownNameError, hint
-from hipg_bench.families.known import definition_of, register_family
+from hipg_bench.families.known import definition_of, import_plugins, register_family
 from hipg_bench.paths import data_folder
 from hipg_bench.spec import TaskSpec
 
@@ -36,6 +36,8 @@ def task_spec(task: str) -> TaskSpec:
     Raises:
         UnknownNameError: no such task; the message holds the nearest name.
     """
+    if task not in tasks() and task not in _added:
+        import_plugins()  # they may add tasks
     known = tasks() if task in tasks() else _added
     if task not in known:
         raise UnknownNameError(f"no task {task!r}{hint(task, [*tasks(), *_added])}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -95,3 +96,83 @@ def test_names_of_families_are_taken_once() -> None:
 def test_a_module_that_is_no_family_is_refused_with_what_it_lacks() -> None:
     with pytest.raises(SpecError, match=r"'nothing' \(json\) lacks .*Params.*begin"):
         hipg_bench.register_family("nothing", json)
+
+
+def plugged(folder: Path, *arguments: str, code: int = 0) -> str:
+    """What hipg-bench says in a folder where nothing is installed."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "hipg_bench", *arguments],
+        capture_output=True, text=True, check=False, cwd=folder, timeout=300,
+        env={**os.environ, "COLUMNS": "200", "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+def test_a_file_beside_the_task_is_a_plug_in_for_one_command_and_its_child_processes(tmp_path: Path) -> None:
+    for name in ("careful_nav.py", "careful_nav-5.toml"):
+        shutil.copy(EXAMPLE / name, tmp_path)
+    task, plugin = "careful_nav-5.toml", ("--plugin", "careful_nav.py")
+    assert "--plugin MODULE" in plugged(tmp_path, "tasks", "show", task, code=2)
+    assert "weights.lost" in plugged(tmp_path, "tasks", "show", task, *plugin)
+    said = plugged(
+        tmp_path, "train", "--task", task, "--steps", "1024", "--set", "num_envs=16", "--out", "run", *plugin
+    )
+    assert "hipg-bench evaluate --agent run --task careful_nav-5.toml --plugin careful_nav.py\n" in said
+    assert "hipg-bench calibrate careful_nav-5.toml --plugin careful_nav.py --write" in said
+    assert "--plugin careful_nav.py" in json.loads((tmp_path / "run" / "train.json").read_text())["command"]
+    # the film is drawn in a child process
+    video = ("--width", "160", "--height", "96", "--fps", "5", "--out", "film.gif")
+    plugged(tmp_path, "video", "--agent", "run", "--task", task, *video, *plugin)
+    assert (tmp_path / "film.gif").stat().st_size > 1000
+    told = json.loads(plugged(tmp_path, "calibrate", task, "--episodes", "8", "--json", *plugin))
+    assert told["anchors"]["reference"]["mean"] > told["anchors"]["random"]["mean"]
+
+
+def test_workers_of_a_sweep_know_a_plug_in_and_the_tasks_that_it_adds(tmp_path: Path) -> None:
+    text = (EXAMPLE / "careful_nav.py").read_text(encoding="utf-8")
+    text += (
+        "\n\nimport sys\nimport hipg_bench\n"
+        "hipg_bench.register_family('careful_nav', sys.modules[__name__])\n"
+        f"hipg_bench.read_task({str(EXAMPLE / 'careful_nav-5.toml')!r})\n"
+    )
+    (tmp_path / "careful_nav.py").write_text(text, encoding="utf-8")
+    (tmp_path / "sweep.toml").write_text(
+        '[[run]]\ntasks = ["careful_nav-5"]\nseeds = [0, 1]\n'
+        "settings = { steps = 256, num_envs = 8, rollout = 8 }\n"
+    )
+    plugged(
+        tmp_path,
+        "train",
+        "--sweep",
+        "sweep.toml",
+        "--workers",
+        "2",
+        "--out",
+        "s",
+        "--plugin",
+        "careful_nav.py",
+    )
+    assert len(list((tmp_path / "s").glob("careful_nav-5/min_health/seed*/policy.safetensors"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("absent.py", None, "there is no such file"),
+        ("absent_module", None, "no such module is installed; a file is named by its path"),
+        ("random.py", "", "'random' is the name of another module: rename the file"),
+        ("raises.py", "1 / 0", "ZeroDivisionError: division by zero"),
+        ("needs.py", "import absent_library", "No module named 'absent_library'"),
+        ("no_family.py", "x = 1", "family 'no_family' (no_family) lacks"),
+    ],
+)
+def test_plug_ins_that_cannot_be_used_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str | None, says: str
+) -> None:
+    monkeypatch.delenv(known.PLUGINS, raising=False)
+    if text is not None:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(SpecError, match=re.escape(says)):
+        known.add_plugin(str(tmp_path / name) if name.endswith(".py") else name)
+    assert known.PLUGINS not in os.environ

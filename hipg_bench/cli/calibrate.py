@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hipg_bench.cli import console
-from hipg_bench.cli.options import NumAgentsOption, SetOption, TaskArgument, task_of
+from hipg_bench.cli.options import NumAgentsOption, PluginOption, SetOption, TaskArgument, task_of
 from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ def calibrate(
     task: TaskArgument,
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
     split: Annotated[
         str,
         typer.Option(help="Split: standard, or measure only the anchors of shift, forced_death or ad_hoc."),

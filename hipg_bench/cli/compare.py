@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hipg_bench.cli import console
+from hipg_bench.cli.options import PluginOption
 from hipg_bench.errors import HipgError
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ def compare(
     episodes: Annotated[
         int, typer.Option(min=1, help="Episodes per task and training seed of agents that are evaluated.")
     ] = 320,
+    plugin: PluginOption = None,
 ) -> None:
     """Rank evaluations on the tasks that all played; compare the first with the others, world by world."""
     from hipg_bench.evaluation import comparing, ranking

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hipg_bench.cli import console
-from hipg_bench.cli.options import AgentOption, NumAgentsOption, SetOption, calibrate_hint, task_of
+from hipg_bench.cli.options import (
+    AgentOption,
+    NumAgentsOption,
+    PluginOption,
+    SetOption,
+    calibrate_hint,
+    task_of,
+)
 
 if TYPE_CHECKING:
     from hipg_bench.evaluation.episodes import EvaluationJob
@@ -33,6 +40,7 @@ def evaluate(
     ] = None,
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
     split: Annotated[
         str,
         typer.Option(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hipg_bench.cli import console
-from hipg_bench.cli.options import AgentOption, NumAgentsOption, SetOption, TaskOption, task_for
+from hipg_bench.cli.options import AgentOption, NumAgentsOption, PluginOption, SetOption, TaskOption, task_for
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +31,7 @@ def video(
     agent: AgentOption = "mappo_minhealth",
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,
@@ -83,6 +84,7 @@ def view(
     agent: AgentOption = "mappo_minhealth",
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
     episode: EpisodeOption = 0,
     seed: SeedOption = 1000,
     train_seed: TrainSeedOption = None,

@@ -57,6 +57,30 @@ SetOption = Annotated[
     typer.Option("--set", help="Change a number of the task, as name=value; may be repeated."),
 ]
 
+
+def _add_plugins(plugins: list[str] | None) -> list[str] | None:
+    from hipg_bench.families.known import add_plugin
+
+    for plugin in plugins or []:
+        add_plugin(plugin)
+    _plugins[:] = plugins or []
+    return plugins
+
+
+_plugins: list[str] = []
+"""The plug-ins of this command."""
+
+
+PluginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        callback=_add_plugins,
+        is_eager=True,
+        help="A module, or its file (.py), with a family of your own; may be repeated.",
+    ),
+]
+
 LauncherOption = Annotated[
     str,
     typer.Option(
@@ -161,7 +185,7 @@ def quoted(path: Path | str) -> str:
 def calibrate_hint(task: str) -> str:
     """How to get the score scale of a task that has none, in one line."""
     if task in _files:
-        return f"hipg-bench calibrate {quoted(_files[task])} --write"
+        return f"hipg-bench calibrate {quoted(_files[task])}{plugin_options()} --write"
     return "make it a file with hipg-bench tasks copy, then: hipg-bench calibrate FILE.toml --write"
 
 
@@ -170,5 +194,10 @@ _files: dict[str, str] = {}
 
 
 def task_option(task: str) -> str:
-    """``--task FILE`` for a task that came from a file, so that its score scale is read from there."""
-    return f" --task {quoted(_files[task])}" if task in _files else ""
+    """``--task FILE`` for a task that came from a file, and the plug-ins that it may need."""
+    return (f" --task {quoted(_files[task])}" if task in _files else "") + plugin_options()
+
+
+def plugin_options() -> str:
+    """The options ``--plugin`` of this command, for the next one."""
+    return "".join(f" --plugin {quoted(plugin)}" for plugin in _plugins)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from hipg_bench.cli import console
-from hipg_bench.cli.options import AgentOption, NumAgentsOption, SetOption, TaskOption, task_for
+from hipg_bench.cli.options import AgentOption, NumAgentsOption, PluginOption, SetOption, TaskOption, task_for
 
 
 def rollout(
@@ -27,6 +27,7 @@ def rollout(
     ] = None,
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
     threads: Annotated[int, typer.Option(min=0, help="Physics threads; 0 uses all cores.")] = 0,
 ) -> None:
     """Play episodes and save every step: observations, actions, rewards, health, joint states."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hipg_bench.cli import console
-from hipg_bench.cli.options import NumAgentsOption, SetOption, TaskArgument, quoted, task_of
+from hipg_bench.cli.options import NumAgentsOption, PluginOption, SetOption, TaskArgument, quoted, task_of
 from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def show(
     task: TaskArgument,
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Show a task's numbers and what its observation, action and joint-state vectors contain."""
@@ -86,6 +87,7 @@ def copy(
     file: Annotated[Path, typer.Argument(help="The new task file, NAME.toml; NAME becomes the task's name.")],
     num_agents: NumAgentsOption = None,
     setting: SetOption = None,
+    plugin: PluginOption = None,
 ) -> None:
     """Copy a task into a new task file, with changed numbers if wanted."""
     from hipg_bench import registry
