@@ -1,9 +1,9 @@
 """A family of one's own: hazard navigation in which the team is charged for every drone that it loses.
 
 What is not said here it has from its parent: world, rules, observations, films, expert, evaluation splits.
-`try_it.py` registers it for one process; ``--plugin examples/careful_nav/careful_nav.py`` makes it known to
-one command, such as ``hipg-bench train --task examples/careful_nav/careful_nav-5.toml``. Installed (``pip install
-examples/careful_nav``), it is known to all.
+`try_it.py` registers it for one process. ``--plugin examples/careful_nav/careful_nav.py`` makes it known to
+one command, such as ``hipg-bench train --task examples/careful_nav/careful_nav-5.toml``. Installed, it is known
+to all: ``pip install examples/careful_nav``.
 """
 
 from __future__ import annotations
