@@ -2,8 +2,8 @@
 
 What is not said here it has from its parent: world, rules, observations, films, expert, evaluation splits.
 `try_it.py` registers it for one process. ``--plugin examples/careful_nav/careful_nav.py`` makes it known to
-one command, such as ``hipg-bench train --task examples/careful_nav/careful_nav-5.toml``. Once it is installed,
-``pip install examples/careful_nav``, it is known to all.
+one command, such as ``hipg-bench train --task examples/careful_nav/careful_nav-5.toml``. Once it is
+installed, by ``pip install examples/careful_nav``, it is known to all.
 """
 
 from __future__ import annotations
