@@ -3,6 +3,8 @@
 import hashlib
 import hmac
 import json
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -103,6 +105,7 @@ def test_where_rows_are_equal(tmp_path, monkeypatch):
     cpuinfo.write_text("processor : 0\nflags : fpu sse2 avx fma avx2\n")
     monkeypatch.setattr(machines.platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(machines.platform, "libc_ver", lambda: ("glibc", "2.36"))
+    monkeypatch.setattr(machines, "rounds_otherwise", lambda: [])
     assert machines.why_rows_may_differ(cpuinfo) is None
     cpuinfo.write_text("processor : 0\nflags : fpu sse2 avx\n")
     assert "no FMA instructions" in machines.why_rows_may_differ(cpuinfo)
@@ -110,6 +113,26 @@ def test_where_rows_are_equal(tmp_path, monkeypatch):
     assert "C library" in machines.why_rows_may_differ(cpuinfo)
     monkeypatch.setattr(machines.platform, "machine", lambda: "aarch64")
     assert "aarch64" in machines.why_rows_may_differ(cpuinfo)
+
+
+def test_a_processor_with_fma_that_does_not_use_it_is_noticed():
+    """GLIBC_TUNABLES takes FMA from the C library, and the processor's flags do not show it."""
+    differs = machines.why_rows_may_differ()
+    if differs:
+        pytest.skip(differs)
+    code = "from hipg_bench.evaluation import machines; print(machines.why_rows_may_differ())"
+    said = {}
+    for tunables in ("", "glibc.cpu.hwcaps=-FMA,-FMA4"):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "GLIBC_TUNABLES": tunables},
+            capture_output=True, text=True, check=True, timeout=60,
+        )  # fmt: skip
+        said[tunables] = done.stdout.strip()
+    assert said.pop("") == "None"
+    (refusal,) = said.values()
+    assert {"sin", "cos", "exp", "log1p"} <= set(re.split(r",? ", refusal))
+    assert "-FMA,-FMA4" in refusal
 
 
 def test_hidden_seeds_are_an_hmac():
