@@ -137,15 +137,17 @@ def _link(
 def for_processor(function: FunctionType, outermost: bool) -> Any:
     """Machine code that runs without the interpreter's lock; that of the outermost is kept on disk."""
     numba = _numba()
+    if not outermost:
+        linking = importlib.import_module("hipg_bench.native_linking")
+        return numba.njit(
+            function, **_OPTIONS, no_cpython_wrapper=True, pipeline_class=linking.LinkedCompiler
+        )
 
     def machine_code(*, kept: bool) -> Any:
-        compiled: Any = numba.njit(function, nogil=True, error_model="numpy", cache=kept)
-        if outermost:
-            compiled.compile(_SIGNATURE)  # now, so that all that is wrong with what is kept shows here
+        compiled = numba.njit(function, **_OPTIONS, nogil=True, cache=kept)
+        compiled.compile(_SIGNATURE)  # now, so that all that is wrong with what is kept shows here
         return compiled
 
-    if not outermost:
-        return machine_code(kept=False)
     notice = threading.Timer(_PATIENCE, print, [_COMPILING], {"file": sys.stderr, "flush": True})
     notice.daemon = True
     notice.start()
@@ -157,6 +159,8 @@ def for_processor(function: FunctionType, outermost: bool) -> Any:
         notice.cancel()
 
 
+_OPTIONS = {"error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+"""Division by zero gives infinity, and nothing is allocated."""
 _PATIENCE = 2.0
 """Seconds after which a user is told what is waited for: machine code that was kept is read sooner."""
 _COMPILING = "hipg-bench: compiling the rules of this family for this machine, once (about 10 s)"

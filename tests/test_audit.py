@@ -72,7 +72,7 @@ def test_the_dead_are_dead_in_the_true_counterfactual() -> None:
     rows = env.fork(env.rows, dict.fromkeys(range(4), 0.0))
     mean, _ = audit._true(actor, settings, rows, 2, np.random.default_rng(0))
     # sum of 0.9^k while it is at least 0.01 (k <= 43), times the charge of a point nobody watches
-    nobody = float(env.spec.params["nobody"]) * env.spec.weights["distance"]
+    nobody = float(env.spec.params["uncovered_distance"]) * env.spec.weights["distance"]
     np.testing.assert_allclose(mean, nobody * sum(0.9**k for k in range(44)), rtol=1e-6)
 
 

@@ -217,3 +217,15 @@ def test_damaged_machine_code_is_compiled_again(tmp_path, damage):
         path.write_bytes(path.read_bytes()[:100] if damage is None else damage)
     assert run() == first
     assert run() == first
+
+
+def test_a_rule_that_allocates_is_refused():
+    """Machine code of rules runs without the interpreter: there is nobody who would free the memory."""
+
+    def allocates(memory, k, last, thread, unused):
+        return len(np.zeros(k))
+
+    kinds = {"pair": (Field("total", np.float64),)}
+    memory = native.Memory(kinds, {"pair": records.dtype(kinds["pair"], {})}, native.for_processor)
+    with pytest.raises(Exception, match="No implementation of function.*zeros"):
+        native.link(allocates, memory, {}, compiler=native.for_processor)

@@ -100,7 +100,7 @@ class NavigationByHand:
     def reward(self) -> float:
         gaps = []
         for p in range(self.n):
-            gap = self.params["nobody"]
+            gap = self.params["uncovered_distance"]
             for i in range(self.n):
                 if self.health[i] > 0:
                     gap = min(gap, math.dist(self.point[p], self.drone[i]))

@@ -131,16 +131,16 @@ def verify(spec: TaskSpec, policy: Policy, job: EvaluationJob, worlds: Sequence[
     """
     recorder = _Recorder(policy)
     job.play(spec, recorder, list(worlds))
-    chance = np.random.default_rng(secrets.randbits(64))
+    rng = np.random.default_rng(secrets.randbits(64))
     compared = 0
     found: dict[tuple[int, int], Difference] = {}
     for record in recorder.records:
         if len(record.episode_id) < 2:
             continue  # played world by world, since the batch failed
         # an order for each world by itself: agents that share between worlds are not always both unchanged
-        order = np.stack([chance.permutation(record.num_agents) for _ in record.episode_id])
+        order = np.stack([rng.permutation(record.num_agents) for _ in record.episode_id])
         for target in order.T[:_REPLAYS]:
-            sizes = _replay(policy, record, target, chance)
+            sizes = _replay(policy, record, target, rng)
             compared += int(np.isfinite(sizes).sum())
             for b, agent in enumerate(target.tolist()):
                 bad = np.flatnonzero(np.nan_to_num(sizes[:, b]) > TOLERANCE)
@@ -152,7 +152,7 @@ def verify(spec: TaskSpec, policy: Policy, job: EvaluationJob, worlds: Sequence[
 
 
 def _replay(
-    policy: Policy, record: _Record, target: Int[np.ndarray, "B"], chance: np.random.Generator
+    policy: Policy, record: _Record, target: Int[np.ndarray, "B"], rng: np.random.Generator
 ) -> Float[np.ndarray, "T B"]:
     """How much each world's target acts otherwise, step by step; NaN from its death on.
 
@@ -162,7 +162,7 @@ def _replay(
     sizes = np.full((steps, worlds), np.nan)
     here = np.arange(worlds)
     # every team-mate's stream is that of the same agent in another world
-    source = (here[:, None] + chance.integers(1, worlds, size=(worlds, record.num_agents))) % worlds
+    source = (here[:, None] + rng.integers(1, worlds, size=(worlds, record.num_agents))) % worlds
     source[here, target] = here
     agents = np.arange(record.num_agents)
     living = np.ones(worlds, bool)

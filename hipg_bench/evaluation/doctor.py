@@ -255,8 +255,8 @@ def _speed() -> Iterator[Finding]:
 
         env = registry.make(_SPEED_TASK, _SPEED_ENVS)
         env.reset()
-        chance = np.random.default_rng(0)
-        action = chance.uniform(-1, 1, (_SPEED_ENVS, env.num_agents, env.action_size))
+        rng = np.random.default_rng(0)
+        action = rng.uniform(-1, 1, (_SPEED_ENVS, env.num_agents, env.action_size))
         env.step(action)
         steps, start = 0, time.perf_counter()
         while (spent := time.perf_counter() - start) < _SPEED_SECONDS:

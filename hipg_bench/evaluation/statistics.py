@@ -34,17 +34,17 @@ Drawn = Sequence[Float[np.ndarray, "... _"]]
 
 def mean_ci95(runs: Runs, *, reps: int = _EPISODE_REPS, seed: int = 1) -> tuple[float, Interval]:
     """Mean over runs of the mean over episodes; runs are redrawn, then episodes within each."""
-    chance = np.random.default_rng(seed)
-    return float(np.mean([run.mean() for run in runs])), _ends(_run_means(runs, reps, chance).mean(axis=1))
+    rng = np.random.default_rng(seed)
+    return float(np.mean([run.mean() for run in runs])), _ends(_run_means(runs, reps, rng).mean(axis=1))
 
 
 def iqm_ci95(
     tasks: Sequence[Runs], *, clip: Interval = CLIP, reps: int = _EPISODE_REPS, seed: int = 1
 ) -> tuple[float, Interval]:
     """`iqm` of (run, task) means where there are few runs: episodes are redrawn within each run."""
-    chance = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     means = [np.clip([run.mean() for run in runs], *clip) for runs in tasks]
-    drawn = [np.clip(_run_means(runs, reps, chance), *clip) for runs in tasks]
+    drawn = [np.clip(_run_means(runs, reps, rng), *clip) for runs in tasks]
     return float(iqm(means)), _ends(iqm(drawn))
 
 
@@ -103,9 +103,9 @@ def ci95(
     Returns:
         Lower and upper end, shaped as one value of the statistic.
     """
-    chance = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     values = [
-        statistic([_redrawn(task, size, chance) for task in scores])
+        statistic([_redrawn(task, size, rng) for task in scores])
         for size in _chunks(reps, sum(map(len, scores)))
     ]
     low, high = np.percentile(np.concatenate(values), [2.5, 97.5], axis=0)
@@ -131,11 +131,11 @@ def improvement_intervals(
     ours: Scores, theirs: Scores, levels: Sequence[float], *, reps: int = _REPS, seed: int = 1
 ) -> list[Interval]:
     """The same at several levels, such as 0.95 and 0.9."""
-    chance = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     pairs = sum(len(a) * len(b) for a, b in zip(ours, theirs, strict=True))
     values = [
         improvement(
-            [_redrawn(task, size, chance) for task in ours], [_redrawn(task, size, chance) for task in theirs]
+            [_redrawn(task, size, rng) for task in ours], [_redrawn(task, size, rng) for task in theirs]
         )
         for size in _chunks(reps, pairs)
     ]
@@ -165,24 +165,24 @@ def paired_difference(
     """
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(f"the same worlds are allowed, got {ours.shape[1]} and {theirs.shape[1]}")
-    chance = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     worlds = ours.shape[1]
     values: list[np.ndarray] = []
     for size in _chunks(reps, worlds):
-        drawn = chance.integers(worlds, size=(size, worlds))
+        drawn = rng.integers(worlds, size=(size, worlds))
         # how often each world was drawn: a mean over drawn worlds is a product with it
         weight = np.stack([np.bincount(row, minlength=worlds) for row in drawn]) / worlds
         sides = [weight @ side.T for side in (ours, theirs)]
         picked = [
-            np.take_along_axis(side, chance.integers(side.shape[1], size=side.shape), axis=1).mean(axis=1)
+            np.take_along_axis(side, rng.integers(side.shape[1], size=side.shape), axis=1).mean(axis=1)
             for side in sides
         ]
         values.append(picked[0] - picked[1])
     return float(ours.mean() - theirs.mean()), _ends(np.concatenate(values))
 
 
-def _redrawn(task: Float[np.ndarray, "R"], size: int, chance: np.random.Generator) -> np.ndarray:
-    return task[chance.integers(len(task), size=(size, len(task)))]
+def _redrawn(task: Float[np.ndarray, "R"], size: int, rng: np.random.Generator) -> np.ndarray:
+    return task[rng.integers(len(task), size=(size, len(task)))]
 
 
 def _chunks(reps: int, numbers: int) -> list[int]:
@@ -191,23 +191,20 @@ def _chunks(reps: int, numbers: int) -> list[int]:
     return [min(step, reps - start) for start in range(0, reps, step)]
 
 
-def _run_means(runs: Runs, reps: int, chance: np.random.Generator) -> Float[np.ndarray, "reps R"]:
+def _run_means(runs: Runs, reps: int, rng: np.random.Generator) -> Float[np.ndarray, "reps R"]:
     """Means of as many redrawn runs as there are, ``reps`` times."""
-    source = chance.integers(len(runs), size=(reps, len(runs)))
+    source = rng.integers(len(runs), size=(reps, len(runs)))
     means = np.empty(source.shape)
     for k, run in enumerate(runs):
         chosen = source == k
-        means[chosen] = _episode_means(run, int(chosen.sum()), chance)
+        means[chosen] = _episode_means(run, int(chosen.sum()), rng)
     return means
 
 
-def _episode_means(run: Float[np.ndarray, "_"], times: int, chance: np.random.Generator) -> np.ndarray:
+def _episode_means(run: Float[np.ndarray, "_"], times: int, rng: np.random.Generator) -> np.ndarray:
     """Means of the run's episodes drawn with replacement."""
     return np.concatenate(
-        [
-            run[chance.integers(run.size, size=(size, run.size))].mean(axis=1)
-            for size in _chunks(times, run.size)
-        ]
+        [run[rng.integers(run.size, size=(size, run.size))].mean(axis=1) for size in _chunks(times, run.size)]
     )
 
 

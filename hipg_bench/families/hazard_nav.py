@@ -53,13 +53,13 @@ class Params(drones.DroneParams):
         hazards: how many of the N points are hazardous.
         hazard_radius: beyond it a hazard is harmless, m.
         hazard_peak: chance of death per 0.1 s at its centre.
-        nobody: distance that is charged for a point when no drone is nearer or alive, m.
+        uncovered_distance: charged for a point when no drone is nearer or alive, m.
     """
 
     hazards: int = pydantic.Field(ge=0, le=31)
     hazard_radius: float = pydantic.Field(gt=0, le=5)
     hazard_peak: float = pydantic.Field(ge=0, lt=1)
-    nobody: float = pydantic.Field(gt=0, le=20)
+    uncovered_distance: float = pydantic.Field(gt=0, le=20)
 
 
 class World(drones.World):
@@ -88,7 +88,7 @@ class Numbers(drones.Numbers):
     hazards: float
     hazard_radius: float
     hazard_peak: float
-    nobody: float
+    uncovered_distance: float
 
 
 class Terms(family.Terms):
@@ -163,7 +163,7 @@ def update(w: World, previous: Previous, scratch: Scratch, task: Numbers) -> Non
     """Work out how well the living cover the points, and who touches whom."""
     agents, touching = len(w.health), 0.0
     for p in range(len(scratch.nearest)):
-        nearest = task.nobody
+        nearest = task.uncovered_distance
         for i in range(agents):
             if w.health[i] > 0:
                 nearest = min(nearest, scratch.distance[i, p])

@@ -49,13 +49,13 @@ class Params(particles.ParticleParams):
         agent_radius: in a team of three, m; a larger team's agents shrink so that their area stays.
         hazards: how many landmarks are hazardous, beside the N safe ones.
         dead_cover: whether a dead agent still covers landmarks, as in the authors' code.
-        nobody: distance charged for a landmark where only the living cover and nobody lives, m.
+        uncovered_distance: charged for a landmark where only the living cover and nobody lives, m.
     """
 
     agent_radius: float = pydantic.Field(gt=0, le=1)
     hazards: int = pydantic.Field(ge=0, le=8)
     dead_cover: bool
-    nobody: float = pydantic.Field(gt=0, le=20)
+    uncovered_distance: float = pydantic.Field(gt=0, le=20)
 
 
 class World(particles.World):
@@ -80,7 +80,7 @@ class Numbers(particles.Numbers):
 
     hazards: float
     dead_cover: bool
-    nobody: float
+    uncovered_distance: float
 
 
 class Terms(family.Terms):
@@ -157,7 +157,7 @@ def update(w: World, previous: Previous, scratch: Scratch, task: Numbers) -> Non
                 if task.dead_cover or health[i] > 0:
                     x, y = point[p, 0] - position[i, 0], point[p, 1] - position[i, 1]
                     nearest = min(nearest, x * x + y * y)
-            scratch.gap += task.nobody if nearest == math.inf else math.sqrt(nearest)
+            scratch.gap += task.uncovered_distance if nearest == math.inf else math.sqrt(nearest)
     w.collisions += scratch.both_live
     w.covered += scratch.gap
     keep_velocities(w, previous)
