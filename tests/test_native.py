@@ -227,5 +227,5 @@ def test_a_rule_that_allocates_is_refused():
 
     kinds = {"pair": (Field("total", np.float64),)}
     memory = native.Memory(kinds, {"pair": records.dtype(kinds["pair"], {})}, native.for_processor)
-    with pytest.raises(Exception, match="No implementation of function.*zeros"):
+    with pytest.raises(Exception, match=r"No implementation of function.*zeros"):
         native.link(allocates, memory, {}, compiler=native.for_processor)
