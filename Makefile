@@ -2,11 +2,12 @@
 #   make evaluate AGENT=random ARGS="--quick"
 #   make test ARGS="-k laws"
 .DEFAULT_GOAL := help
-.PHONY: help setup evaluate test test-long test-rllib test-benchmarl lint format leaderboard bench bench-peers golden freeze clean
+.PHONY: help setup docs evaluate test test-long test-rllib test-benchmarl lint format leaderboard bench bench-peers golden freeze clean
 
 BIN := .venv/bin
 READY := .venv/.ready
 READY_FOR_TESTS := .venv/.tests-ready
+READY_FOR_DOCS := .venv/.docs-ready
 CORES ?= $(shell nproc)
 AGENT ?= mappo_minhealth
 ARGS ?=
@@ -21,6 +22,12 @@ $(READY): pyproject.toml constraints.txt scripts/setup.sh
 
 $(READY_FOR_TESTS): $(READY) scripts/setup.sh
 	scripts/setup.sh --tests
+
+$(READY_FOR_DOCS): $(READY) scripts/setup.sh
+	scripts/setup.sh --docs
+
+docs: $(READY_FOR_DOCS) ## the documentation site, in build/site; ARGS="serve" shows it while you write
+	NO_MKDOCS_2_WARNING=1 DISABLE_MKDOCS_2_WARNING=true $(BIN)/mkdocs $(or $(ARGS),build)
 
 evaluate: $(READY) ## score an agent on the standard suite, with films
 	$(BIN)/hipg-bench evaluate --agent $(AGENT) $(ARGS)

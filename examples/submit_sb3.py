@@ -1,4 +1,4 @@
-"""Stable-Baselines3's PPO, trained and written into an agent's folder for the leaderboard: docs/submit.md."""
+"""Stable-Baselines3's PPO, trained and written into an agent's folder: docs/guides/submit.md."""
 
 import argparse
 from pathlib import Path

@@ -3,7 +3,8 @@
 # libraries that render video without a screen. Safe to run again; `make` runs it when it is needed.
 #
 #   PYTHON=python3.12 scripts/setup.sh    use this Python instead of the newest one found
-#   scripts/setup.sh --tests              a browser and a virtual display, which only the tests use
+#   scripts/setup.sh --docs               the packages that build the documentation site
+#   scripts/setup.sh --tests              these, a browser and a virtual display, which only the tests use
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -121,7 +122,18 @@ install_for_tests() {
     fi
 }
 
+# --- what builds the documentation site -------------------------------------------------------------
+install_for_docs() {
+    .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[docs]'
+    touch .venv/.docs-ready
+}
+
+if [ "${1:-}" = --docs ]; then
+    install_for_docs
+    exit
+fi
 if [ "${1:-}" = --tests ]; then
+    install_for_docs
     install_for_tests
     touch .venv/.tests-ready
     exit

@@ -275,7 +275,9 @@ def test_a_rule_from_outside_is_found_by_module_and_function(tmp_path: Path, mon
 
 
 def test_the_documents_example_is_a_rule(tmp_path: Path, monkeypatch) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", Path("docs/credit.md").read_text(), re.DOTALL)
+    (code,) = re.findall(
+        r"```python\n(.*?)```", Path("docs/guides/own_credit_rule.md").read_text(), re.DOTALL
+    )
     (tmp_path / "my_rules.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     _, inputs = played("coop_nav-3", "central")

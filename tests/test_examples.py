@@ -46,7 +46,7 @@ WINDOWS = {"dm_viewer.py"}
 """These open a window: they are run beside the tests of what they show."""
 
 SUBMISSIONS = {"submit_sb3.py", "submit_cleanrl.py"}
-"""`test_newcomer.py` runs these, as docs/submit.md says."""
+"""`test_newcomer.py` runs these, as docs/guides/submit.md says."""
 
 
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: run.example)

@@ -1,4 +1,4 @@
-"""docs/submit.md, command by command: a newcomer trains and packs, a maintainer adds and verifies."""
+"""docs/guides/submit.md, command by command: a newcomer trains and packs, a maintainer adds and verifies."""
 
 import os
 import re
@@ -17,7 +17,7 @@ from hipg_bench.policies.network import GRUSpec, load_network
 from hipg_bench.submissions.archive import unpack
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "submit.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "guides" / "submit.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
 CODE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
@@ -49,9 +49,9 @@ def run_in_a_checkout(folder, blocks, home):
     return said
 
 
-def test_the_readme_leads_from_a_training_to_a_verified_entry(tmp_path):
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"## Enter the leaderboard\n```sh\n(.*?)```", readme, re.DOTALL)
+def test_the_guide_leads_from_a_training_to_a_verified_entry(tmp_path):
+    page = (ROOT / "docs" / "guides" / "leaderboard.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"## Enter the leaderboard\n```sh\n(.*?)```", page, re.DOTALL)
     (checkout := tmp_path / "checkout").mkdir()
     (home := tmp_path / "home").mkdir()
     (said,) = run_in_a_checkout(checkout, [block], home)
@@ -101,7 +101,7 @@ def test_what_the_page_exports_can_be_read(tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for block in CODE:
-            exec(compile(block, "docs/submit.md", "exec"), shown)
+            exec(compile(block, "docs/guides/submit.md", "exec"), shown)
     networks = {
         name: load_network(tmp_path / f"{name}_agent/hazard_nav-4/seed0.safetensors")
         for name in ("mlp", "gru", "attention")

@@ -1,6 +1,6 @@
 """The paper suite against the authors' laws and the numbers measured on their code.
 
-Expected values are worked out here with plain loops and `math`, from the laws in docs/paper_suite.md;
+Expected values are worked out here with plain loops and `math`, from the laws in docs/tasks/paper_suite.md;
 reference returns are those that the authors' environments gave over 200 episodes.
 """
 

@@ -1,6 +1,7 @@
-"""What the README shows works as shown."""
+"""What the README and the guide to adapters show works as shown."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ import pytest
 from PIL import Image
 
 README = Path(__file__).parent.parent / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+ADAPTERS_PAGE = README.parent / "docs" / "guides" / "adapters.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", ADAPTERS_PAGE.read_text(encoding="utf-8"), re.DOTALL)
 ADAPTERS = {
     "PettingZoo": "pettingzoo",
     "Gymnasium": "gymnasium",
@@ -27,13 +29,27 @@ def block_on(adapter: str) -> str:
     return code
 
 
-def test_the_python_example_runs_and_prints_a_return_and_deaths(capsys) -> None:
-    (code,) = [block for block in BLOCKS if not block.startswith("# ")]
+def test_the_python_example_prints_what_the_readme_shows(capsys) -> None:
+    text = README.read_text(encoding="utf-8")
+    (code, shown), *others = re.findall(r"```python\n(.*?)```\n```\n(.*?)```", text, re.DOTALL)
+    assert not others
     exec(compile(code, README, "exec"), {})
-    episode_return, deaths = map(float, capsys.readouterr().out.split())
-    # anchor of random play in the task file: -30.3; 64 episodes with a deviation of about 3.4 each
-    assert abs(episode_return + 30.3) < 3
-    assert 0 < deaths < 8
+    assert capsys.readouterr().out == shown
+
+
+def test_results_are_those_of_the_bundles() -> None:
+    """The first three columns of the table of results, from the records beside the weights."""
+    rows = re.findall(
+        r"^\| `(\S+-\d+)` \|((?: [\d.]+ \[[^|]*\|){3})", README.read_text("utf-8"), re.MULTILINE
+    )
+    assert len(rows) == 7
+    for task, cells in rows:
+        agents = ("mappo_minhealth", "mappo_central", "mappo_local")
+        for agent, cell in zip(agents, cells.strip(" |").split("|"), strict=True):
+            records = list((README.parent / "agents" / agent / task).glob("seed?.json"))
+            result = json.loads(min(records).read_text(encoding="utf-8"))["result"]
+            low, high = result["score_ci95"]
+            assert cell.strip() == f"{result['score']:.2f} [{low:.2f}, {high:.2f}]"
 
 
 @pytest.mark.parametrize("adapter", ADAPTERS)
@@ -68,7 +84,8 @@ def test_every_command_shown_exists() -> None:
 
     from hipg_bench.cli import app
 
-    shown = set(re.findall(r"hipg-bench ([a-z]+)", README.read_text(encoding="utf-8")))
+    text = re.sub(r"```bibtex\n.*?```", "", README.read_text(encoding="utf-8"), flags=re.DOTALL)
+    shown = set(re.findall(r"hipg-bench ([a-z]+)", text))
     assert {"evaluate", "train", "video", "bench", "calibrate", "doctor"} <= shown
     assert shown <= set(get_command(app).commands)
 

@@ -250,7 +250,7 @@ BROKEN = {
     too_small: ("error", "hazard_nav-4, seed 0", "(O, A) = (51, 3), its network (50, 3)", "right folder?"),
     of_torch: ("error", "hazard_nav-4/seed0.pt", "write weights as .safetensors or", "convert"),
     undeclared: ("error", "hazard_nav-4, seed 0", "formats 'hipg-mlp-1'", "hipg_bench.policies.export"),
-    misspelt: ("error", "agent.toml", "no field 'licence'; did you mean 'license'?", "docs/submit.md"),
+    misspelt: ("error", "agent.toml", "no field 'licence'; did you mean 'license'?", "docs/guides/submit.md"),
     unsigned: ("error", "agent.toml: authors", "is missing", 'authors = "Ada'),
     unlicensed: ("advice", "agent.toml: license", "is no SPDX identifier", "MIT, Apache-2.0"),
     without_readme: ("error", "README.md", "is missing", "how it was trained"),

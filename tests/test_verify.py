@@ -514,7 +514,7 @@ OPTIONS = ("--tasks", TASK, "--splits", "standard", "--films", "none", "--thread
 
 
 def test_the_commands_from_a_zip_to_a_page(tmp_path):
-    """What docs/leaderboard.md tells a maintainer, word by word."""
+    """What docs/guides/leaderboard.md tells a maintainer, word by word."""
     board, package = tmp_path / "board", zipped(network(tmp_path / "newcomer"))
 
     def run(*args):

@@ -191,7 +191,7 @@ def _print_summary(results: dict[str, Any], folder: Path) -> None:
             else ""
         )
         console.say(
-            f"\nscore, interquartile mean over {whole['tasks']} tasks{zero}: "
+            f"\nscore, interquartile mean over {whole['tasks']} task{'s' * (whole['tasks'] != 1)}{zero}: "
             f"{number(whole['score_iqm'])} {interval(whole['score_iqm_ci95'])}"
         )
     for task in results["tasks"]:

@@ -85,7 +85,8 @@ LauncherOption = Annotated[
     str,
     typer.Option(
         "--launcher",
-        help="Where jobs run: local (processes of this machine), ray or slurm; see docs/clusters.md.",
+        help="Where jobs run: local (processes of this machine), ray or slurm; "
+        "see docs/guides/many_machines.md.",
     ),
 ]
 LauncherOptions = Annotated[

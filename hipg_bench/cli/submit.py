@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hipg_bench.submissions.findings import Finding
 
 app = typer.Typer(
-    help="Create, check and pack an agent for the leaderboard (docs/submit.md).", no_args_is_help=True
+    help="Create, check and pack an agent for the leaderboard (docs/guides/submit.md).", no_args_is_help=True
 )
 
 Folder = Annotated[Path, typer.Argument(help="The agent's folder, with agent.toml.")]
@@ -55,8 +55,9 @@ def init(
 
 _WEIGHTS = (
     "write <task>/seed<k>.safetensors into {name}, such as {name}/hazard_nav-4/seed0.safetensors: "
-    "docs/submit.md shows how; or begin from a training run, with --from-run",
-    "write <task>/seed<k>.onnx into {name}, such as {name}/hazard_nav-4/seed0.onnx: docs/submit.md shows how",
+    "docs/guides/submit.md shows how; or begin from a training run, with --from-run",
+    "write <task>/seed<k>.onnx into {name}, such as {name}/hazard_nav-4/seed0.onnx: "
+    "docs/guides/submit.md shows how",
     "write {name}/agent.py, and name its tasks and training seeds under [tasks] in {name}/agent.toml",
 )
 

@@ -100,7 +100,7 @@ def draw(runs: Sequence[Trace], tasks: Sequence[str], algorithms: Sequence[str],
     figure.legend(
         handles=[
             Line2D([], [], color=colour, marker=marker, linewidth=2, markersize=7, label=name)
-            for name, colour, marker in _looks(algorithms).values()
+            for name, colour, marker in styles_of(algorithms).values()
         ],
         loc="outside lower center",
         ncols=3 if any("-" in algorithm for algorithm in algorithms) else len(algorithms),
@@ -142,13 +142,13 @@ def _panel(axes: Axes, task: str, runs: Sequence[Trace], algorithms: Sequence[st
         return
     for level in (0.0, 1.0):
         axes.axhline(level, color=_PALE, linewidth=0.8, linestyle=(0, (1, 3)), zorder=0)
-    looks, counts = _looks(algorithms), list[int]()
+    styles, counts = styles_of(algorithms), list[int]()
     for algorithm in algorithms:
         own = [run for run in runs if run.algorithm == algorithm]
         if not own:
             continue
         steps, middle, low, high = band_of(own, band)
-        _, colour, marker = looks[algorithm]
+        _, colour, marker = styles[algorithm]
         every = max(1, len(steps) // 8)
         axes.fill_between(steps / 1e6, low, high, color=colour, alpha=0.14, linewidth=0)
         axes.plot(
@@ -162,15 +162,15 @@ def _panel(axes: Axes, task: str, runs: Sequence[Trace], algorithms: Sequence[st
     axes.set_xlim(left=0)
 
 
-def _looks(algorithms: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+def styles_of(algorithms: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     """Name, colour and marker of each algorithm and variant."""
-    looks, spare = dict[str, tuple[str, str, str]](), itertools.cycle(_VARIANTS)
+    styles, spare = dict[str, tuple[str, str, str]](), itertools.cycle(_VARIANTS)
     for algorithm in algorithms:
         plain, _, label = algorithm.partition("-")
         name, colour, marker = _ALGORITHMS[plain]
         variant = f"{name}, {label.replace('_', ', ')}"
-        looks[algorithm] = (variant, *next(spare)) if label else (name, colour, marker)
-    return looks
+        styles[algorithm] = (variant, *next(spare)) if label else (name, colour, marker)
+    return styles
 
 
 def _algorithms_of(family: str, tasks: Sequence[str], runs: Sequence[Trace]) -> list[str]:

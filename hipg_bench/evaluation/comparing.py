@@ -47,7 +47,7 @@ class _Aggregate(_Document):
 
 
 class _Results(_Document):
-    """What comparisons need of ``results.json``; the rest is in ``docs/protocol.md``."""
+    """What comparisons need of ``results.json``; the rest is in ``docs/concepts/protocol.md``."""
 
     schema_: Literal[2] = pydantic.Field(alias="schema")
     suite: str

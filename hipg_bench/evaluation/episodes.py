@@ -37,7 +37,7 @@ _COMMON = ("return", "length", "survival", "deaths", "first_death")
 """Metrics every family has; they stand in the row itself."""
 
 Row = dict[str, Any]
-"""One episode, ready for JSON; ``docs/protocol.md`` explains its fields."""
+"""One episode, ready for JSON; ``docs/concepts/protocol.md`` explains its fields."""
 Advance = Callable[[float], None]
 """Told how much was played since last time, in episodes."""
 

@@ -1,4 +1,4 @@
-"""From rows to numbers: what ``results.json`` says of a task and of a suite; see ``docs/protocol.md``."""
+"""From rows to ``results.json``, of a task and of a suite; see ``docs/concepts/protocol.md``."""
 
 from __future__ import annotations
 

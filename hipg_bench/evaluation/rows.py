@@ -34,7 +34,7 @@ class _Death(Params):
 
 
 class _RowModel(Params):
-    """The fields of ``docs/protocol.md``, with their ranges."""
+    """The fields of ``docs/concepts/protocol.md``, with their ranges."""
 
     task: _Name
     version: _Count

@@ -160,7 +160,7 @@ def check_target(out: str) -> None:
 
 
 def write(out: str, spec: TaskSpec, agent: str, episodes: Sequence[Trajectory]) -> None:
-    """Write episodes to an .npz file or a Minari data set; see ``docs/datasets.md``.
+    """Write episodes to an .npz file or a Minari data set; see ``docs/guides/datasets.md``.
 
     Raises:
         HipgError: as `check_target` says.

@@ -150,9 +150,9 @@ class Metrics(family.Metrics):
     displacement: float  # of the plank, m
     slip: float  # of it, over its live carriers, m
     carriers: float  # alive at the end
-    tipped: float
-    sunk: float
-    dropped: float
+    tipped: float  # walkers that tipped over
+    sunk: float  # walkers that sank down
+    dropped: float  # 1 where the plank is on the ground at the end
 
 
 # --- rules, in the order of a step ---------------------------------------------------------------------

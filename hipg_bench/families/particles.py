@@ -1,6 +1,6 @@
 """Particles in a plane: body, physics, contacts, senses and deaths that the paper's tasks share.
 
-The numbers and laws are those of the authors' code, see ``docs/paper_suite.md``. One control step is
+The numbers and laws are those of the authors' code, see ``docs/tasks/paper_suite.md``. One control step is
 one physics step: v <- (1 - damping) v + F dt, then x <- x + v dt. MuJoCo's Euler integrator, which
 treats joint damping D implicitly, does exactly this for a mass of 1 kg when 1 + dt D = 1 / (1 - damping)
 and every force is multiplied by that same factor: v' = (v + dt factor F) / (1 + dt D).
@@ -120,8 +120,8 @@ class Numbers(family.Numbers):
 class Metrics(family.Metrics):
     """Of an episode."""
 
-    deaths_hazard: float
-    deaths_collision: float
+    deaths_hazard: float  # agents that a hazard killed
+    deaths_collision: float  # agents that a collision killed
 
 
 # --- rules ---------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def check(folder: Path, *, trust: bool = False) -> Iterator[Finding]:
         card, files = read_card(folder / "agent.toml"), bundle_files(folder)
     except BundleError as trouble:
         reason = str(trouble).removeprefix(f"{folder / 'agent.toml'}: ")
-        yield error("agent.toml", reason, "docs/submit.md lists the fields of the card")
+        yield error("agent.toml", reason, "docs/guides/submit.md lists the fields of the card")
         return
     agent = Agent(card, folder, trust)
     yield from look_at_card(card)
@@ -48,7 +48,9 @@ def check(folder: Path, *, trust: bool = False) -> Iterator[Finding]:
         missing = list(_look_at_module(agent))
         yield from missing or _play(agent)
     except BundleError as trouble:  # of a file's name or kind, wherever it was met first
-        yield error("files", str(trouble), "docs/submit.md says where files lie and what they are called")
+        yield error(
+            "files", str(trouble), "docs/guides/submit.md says where files lie and what they are called"
+        )
 
 
 def _without_card(folder: Path) -> Finding:

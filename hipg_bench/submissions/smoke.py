@@ -178,5 +178,5 @@ def _reminder(agent: Agent, spec: TaskSpec) -> str:
     if agent.card.kind == "network":
         return f"hipg_bench.policies.export writes such files; `hipg-bench tasks show {spec.task}` has (O, A)"
     if agent.card.kind == "onnx":
-        return "docs/submit.md shows torch.onnx.export with the names and shapes that are needed"
-    return "docs/submit.md says what agent.toml must say"
+        return "docs/guides/submit.md shows torch.onnx.export with the names and shapes that are needed"
+    return "docs/guides/submit.md says what agent.toml must say"
