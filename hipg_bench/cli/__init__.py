@@ -29,6 +29,7 @@ from hipg_bench.cli import (
     evaluate,
     export,
     figures,
+    hub,
     leaderboard,
     media,
     reproduce,
@@ -102,6 +103,7 @@ app.command()(rollout.rollout)
 app.add_typer(tasks.app, name="tasks")
 app.add_typer(agents.app, name="agents")
 app.add_typer(submit.app, name="submit")
+app.add_typer(hub.app, name="hub")
 app.add_typer(leaderboard.app, name="leaderboard")
 app.add_typer(suite.app, name="suite")
 app.command()(calibrate.calibrate)
