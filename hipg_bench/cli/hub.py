@@ -46,7 +46,7 @@ def push(
 
     if not dry_run and out is not None:
         raise HipgError("--out belongs to --dry-run")
-    if not (dry_run or yes or sys.stdin.isatty()):
+    if not (dry_run or yes or _is_interactive()):
         raise HipgError("nothing is uploaded without being asked for: give --yes, or look with --dry-run")
     folder = load_agent(agent).folder
     if evaluation is None:
@@ -81,6 +81,11 @@ def pull(
     folder, commit = hub.pull(repo, out, revision=revision)
     console.say(f"{folder}: {repo} at commit {commit}")
     console.say(f"next: hipg-bench evaluate --agent {quoted(folder)}")
+
+
+def _is_interactive() -> bool:
+    """Whether somebody can be asked."""
+    return sys.stdin.isatty()
 
 
 def _list(folder: Path) -> None:

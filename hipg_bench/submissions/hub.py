@@ -12,6 +12,7 @@ import importlib
 import json
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
@@ -160,7 +161,7 @@ def _check_sound(folder: Path, name: str | None = None) -> None:
     """Refuse a bundle that `submit check` would."""
     errors = [finding for finding in check(folder) if finding.severity == "error"]
     if errors:
-        told = "".join(f"\n  {one.where}: {one.what}" for one in errors)
+        told = "".join(f"\n  {one.where}: {one.what}" for one in errors).replace(f"{folder}/", "")
         more = "" if name else f"\nhipg-bench submit check {folder} tells what to do"
         raise BundleError(f"{name or folder} has {len(errors)} error{'s' * (len(errors) > 1)}:{told}{more}")
 
@@ -289,9 +290,16 @@ def _one_line_errors(repo: str) -> Generator[None]:
         raise HipgError(
             f"{repo}: there is no such repository, or it is not yours to see: log in with `hf auth login`"
         ) from error
-    except (hub.errors.HfHubHTTPError, hub.errors.HFValidationError, OSError, ValueError) as error:
+    except HipgError:
+        raise
+    except (hub.errors.HfHubHTTPError, OSError, ValueError, *_network_errors()) as error:
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise HipgError(f"{repo}: {first}") from error
+
+
+def _network_errors() -> list[type[Exception]]:
+    """What the library's HTTP client raises, whichever it uses."""
+    return [sys.modules[name].HTTPError for name in ("httpx", "httpx2") if name in sys.modules]
 
 
 def _library() -> Any:
