@@ -253,6 +253,13 @@ class _Child:
         self.process.kill()
 
 
+def stop_when_orphaned() -> None:
+    """End this process where the driver that started it was killed, which cannot say so any more."""
+    driver = multiprocessing.parent_process()
+    if driver is not None and not driver.is_alive():
+        os._exit(1)
+
+
 def _perform_and_tell(job: Job, mouth: Connection) -> None:
     mouth.send(perform(job))
 

@@ -12,16 +12,21 @@ import typer
 from hipg_bench.cli import console
 from hipg_bench.cli.options import (
     AgentOption,
+    LauncherOptions,
     NumAgentsOption,
     PluginOption,
     SetOption,
     calibrate_hint,
+    launcher_of,
+    parse_shard,
     task_of,
 )
+from hipg_bench.errors import SpecError
 
 if TYPE_CHECKING:
     from hipg_bench.evaluation.episodes import EvaluationJob
     from hipg_bench.evaluation.runner import Suite
+    from hipg_bench.launchers import Launcher
     from hipg_bench.policies.bundle import Agent
 
 _QUICK = 32
@@ -67,6 +72,22 @@ def evaluate(
             "--quick", help="Play 32 episodes without videos, for a first look and not for comparisons."
         ),
     ] = False,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            help="I/N: play only part I of N, counted from 1, into the same --out on a shared disk. "
+            "The process that finishes last writes the results."
+        ),
+    ] = None,
+    launcher: Annotated[
+        str | None,
+        typer.Option(help="Play in many processes: local, ray or slurm; see docs/clusters.md."),
+    ] = None,
+    launcher_option: LauncherOptions = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes at a time with --launcher or --shard; by default one per core."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
 ) -> None:
     """Evaluate an agent on tasks; write scores, episode rows, videos and a report."""
@@ -85,12 +106,56 @@ def evaluate(
         runner.playable(who, suite, name)
     folder = out or new_folder(Path("runs"), f"{who.name}-{time.strftime('%Y%m%d-%H%M%S')}")
     parts = {name: folder / name for name in splits.SPLITS} if split == "all" else {split: folder}
+    shared = shard is not None or launcher is not None or workers is not None
+    if shared and out is None:
+        raise SpecError("--shard, --launcher and --workers need --out, the folder that the processes share")
     every: dict[str, Any] = {}
     for name, part in parts.items():
         split_plan = dataclasses.replace(job, split=name)
+        if shared:
+            engine = launcher_of(launcher or "local", workers, launcher_option)
+            one_thread = dataclasses.replace(split_plan, threads=1)
+            if not _play_blocks(who, agent, suite, part, one_thread, engine, shard):
+                continue
         every[name] = _evaluate(who, suite, part, split_plan, films, silent=as_json)
     if as_json:
-        console.show_json(every if split == "all" else every[split])
+        console.show_json(every if split == "all" else every.get(split))
+
+
+def _play_blocks(
+    who: Agent,
+    agent: str,
+    suite: Suite,
+    folder: Path,
+    job: EvaluationJob,
+    engine: Launcher,
+    shard: str | None,
+) -> bool:
+    """Play this process's part of an evaluation; return whether the results are left to this process."""
+    from hipg_bench import launchers
+    from hipg_bench.claims import owner
+    from hipg_bench.evaluation import runner
+    from hipg_bench.policies.bundle import agents
+
+    name = agent if agent in agents() else str(Path(agent).resolve())
+    every = runner.prepare(who, name, suite, folder, job)
+    index, count = (0, 1) if shard is None else parse_shard(shard)
+    mine = {block.folder: block for block in every[index::count]}
+    with console.progress() as bars:
+        bar = bars.add_task(job.split, total=len(mine))
+
+        def report() -> None:
+            bars.update(bar, completed=sum(block.finished for block in mine.values()))
+
+        jobs = [block.launcher_job() for block in mine.values()]
+        launchers.work_off(jobs, engine, lambda one: mine[one.folder].finished, report)
+    left = sum(not block.finished for block in every)
+    writer = owner(folder)
+    if left:
+        console.warn(f"{folder}: {left} of {len(every)} blocks are left to other shards")
+    elif writer is not None and writer.alive:
+        console.warn(f"{folder}: process {writer.pid} on {writer.host} writes the results")
+    return not left and (writer is None or not writer.alive)
 
 
 def _evaluate(

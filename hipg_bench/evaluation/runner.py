@@ -15,22 +15,26 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
+import shutil
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hipg_bench import registry
+from hipg_bench.claims import HeldError
 from hipg_bench.documents import read_json
 from hipg_bench.errors import BundleError, ResumeError, SpecError, UnknownNameError
-from hipg_bench.evaluation import films, protocol, report, splits
+from hipg_bench.evaluation import blocks, films, protocol, report, splits
+from hipg_bench.evaluation.blocks import Block
 from hipg_bench.evaluation.episodes import EvaluationJob, Row, versions
 from hipg_bench.evaluation.failures import NOT_PLAYED, close
 from hipg_bench.evaluation.latency import Stopwatch
 from hipg_bench.evaluation.ranking import kind_of
 from hipg_bench.evaluation.results import SCHEMA, aggregate, summarise
 from hipg_bench.evaluation.rows import read_rows
-from hipg_bench.evaluation.seeds import commitment
+from hipg_bench.evaluation.seeds import WORLDS_PER_SEED, commitment
 from hipg_bench.paths import check_seal, output_folder, remove_partial, write_text
 from hipg_bench.policies.bundle import Agent
 from hipg_bench.spec import TaskSpec
@@ -41,6 +45,8 @@ Progress = Callable[[str, float], None]
 
 _RECORD = "run.json"
 """The file that says which evaluation a folder is of."""
+_PATIENCE = 60.0
+"""Seconds that another process has to begin an evaluation that is shared."""
 _FOLDERS = ("episodes", "films", "videos")
 _RESULTS = ("results.json", "report.html", "films", "videos")
 """What an evaluation may overwrite; rows in ``episodes`` are read and gone on with."""
@@ -131,9 +137,8 @@ def evaluate(
     """
     seeds, skipped = playable(agent, suite, job.split)
     specs = [splits.with_anchors(job.split, spec) for spec in suite.specs]
-    worlds = {"seed": job.seed} if job.salt is None else {"commitment": commitment(job.salt)}
-    run = {"agent": agent.name, "split": job.split, **worlds, "versions": versions()}
-    with _alone_in(out, run):
+    worlds = _which_worlds(job)
+    with _alone_in(out, _record(agent, job)):
         seconds: dict[str, float] = {}
         watches: dict[str, Stopwatch] = {}
         rows: dict[str, list[Row]] = {}
@@ -177,6 +182,7 @@ def evaluate(
             write_text(out / "report.html", page)
 
         write()
+        shutil.rmtree(out / blocks.FOLDER, ignore_errors=True)  # their rows are in ``episodes``
         scored(results)
         if films_per_task:
             try:
@@ -185,6 +191,62 @@ def evaluate(
             finally:
                 write()
         return results
+
+
+def prepare(agent: Agent, name: str, suite: Suite, out: Path, job: EvaluationJob) -> list[Block]:
+    """Begin or join an evaluation that many processes share; return the blocks to be played.
+
+    Args:
+        agent: who plays.
+        name: its name or path, from which other processes load it.
+        suite: what.
+        out: folder, new or of the same evaluation.
+        job: which worlds.
+
+    Raises:
+        BundleError: the agent plays none of the tasks.
+        ResumeError: as `evaluate` says.
+    """
+    if job.salt is not None:
+        raise SpecError("hidden worlds are played in one process: the salt is told to no other")
+    seeds, _ = playable(agent, suite, job.split)
+    run, out = _record(agent, job), out.resolve()
+    until = time.monotonic() + _PATIENCE
+    while True:
+        _check_belongs(out, run)
+        if (out / _RECORD).exists():
+            break
+        try:
+            with _alone_in(out, run):
+                pass
+        except HeldError:  # another process begins it
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.1)
+    specs = [splits.with_anchors(job.split, spec) for spec in suite.specs]
+    found = [
+        Block(name, spec, identity, number, out, job, run)
+        for spec in specs
+        for identity in _identities(agent, spec, seeds.get(spec.task, ())).values()
+        for number in range(math.ceil(job.episodes / WORLDS_PER_SEED))
+    ]
+    return sorted(found, key=lambda block: block.number)
+
+
+def _record(agent: Agent, job: EvaluationJob) -> dict[str, Any]:
+    """What ``run.json`` says of an evaluation."""
+    suite = protocol.identity()
+    return {
+        "agent": agent.name,
+        "split": job.split,
+        **_which_worlds(job),
+        "versions": versions(),
+        "suite": f"{suite['suite']} {suite['digest']}",
+    }
+
+
+def _which_worlds(job: EvaluationJob) -> dict[str, Any]:
+    return {"seed": job.seed} if job.salt is None else {"commitment": commitment(job.salt)}
 
 
 def _film(
@@ -231,14 +293,16 @@ def _play_task(
 ) -> list[Row]:
     """Play what is missing of one task; the file is whole after every batch."""
     path = out / "episodes" / f"{spec.task}.jsonl"
-    identity = {
-        k: {
-            "task": spec.task, "version": spec.version, "fingerprint": spec.fingerprint, "agent": agent.name,
-            "policy": agent.fingerprint(spec.task, k), "train_seed": k, "versions": versions(),
-        }
-        for k in train_seeds
-    }  # fmt: skip
+    identity = _identities(agent, spec, train_seeds)
     rows = {(row["train_seed"], row["world"]): row for row in _resumed(path, spec, identity, job)}
+    for train_seed, played in _of_blocks(out, spec, identity, job).items():
+        known = {world: row for (seed, world), row in rows.items() if seed == train_seed}
+        known = {row["world"]: row for row in played} | known
+        policy = agent.policy(spec, train_seed)
+        for row in blocks.cut_after_dnf(spec, policy, list(known.values()), job):
+            rows[train_seed, row["world"]] = row
+    if rows:
+        _write_rows(path, rows)
     progress(spec.task, len(rows))
     for train_seed in train_seeds:
         policy = watch.timed(agent.policy(spec, train_seed))
@@ -247,6 +311,34 @@ def _play_task(
             rows |= {(train_seed, row["world"]): identity[train_seed] | row for row in played}
             _write_rows(path, rows)
     return [rows[key] for key in sorted(rows)]
+
+
+def _identities(agent: Agent, spec: TaskSpec, train_seeds: Sequence[int]) -> dict[int, Row]:
+    """What rows say of the task, the policy of each training seed and the versions."""
+    return {
+        k: {
+            "task": spec.task, "version": spec.version, "fingerprint": spec.fingerprint, "agent": agent.name,
+            "policy": agent.fingerprint(spec.task, k), "train_seed": k, "versions": versions(),
+        }
+        for k in train_seeds
+    }  # fmt: skip
+
+
+def _of_blocks(
+    out: Path, spec: TaskSpec, identity: Mapping[int, Row], job: EvaluationJob
+) -> dict[int, list[Row]]:
+    """Rows of blocks, by training seed.
+
+    Raises:
+        ResumeError: they are of another evaluation, or damaged.
+    """
+    found: dict[int, list[Row]] = {}
+    run = read_json(out / _RECORD)
+    for path in sorted((out / blocks.FOLDER).glob(f"{spec.task}-seed*/{blocks.ROWS}")):
+        blocks.check_record(path.with_name(blocks.RECORD), run)
+        for row in _resumed(path, spec, identity, job):
+            found.setdefault(row["train_seed"], []).append(row)
+    return found
 
 
 def _write_rows(path: Path, rows: Mapping[tuple[int, int], Row]) -> None:

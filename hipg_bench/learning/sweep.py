@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -203,7 +201,5 @@ def _train(settings: AnySettings, out: Path, command: str) -> None:
 
 
 def _stop_when_orphaned(iteration: int, log: dict[str, float]) -> None:
-    """End this process where the sweep's own was killed, which cannot say so any more."""
-    sweep = multiprocessing.parent_process()
-    if sweep is not None and not sweep.is_alive():
-        os._exit(1)
+    """See `launchers.stop_when_orphaned`."""
+    launchers.stop_when_orphaned()
