@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hipg_bench.cli import console
+from hipg_bench.cli import console, outputs
 from hipg_bench.errors import HipgError, SpecError
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ def audit(
     from hipg_bench.learning import audit as audits
     from hipg_bench.learning.gradient_noise import gradient_noise
 
+    if plot is not None:
+        outputs.check_free(plot, outputs.PICTURE)
     torch.set_num_threads(threads)
     source = _source(run, agent, task, seed)
     actor, critic, settings = audits.load(source)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hipg_bench.cli import console
+from hipg_bench.cli import console, outputs
 from hipg_bench.errors import UnknownNameError, hint
 
 if TYPE_CHECKING:
@@ -133,6 +133,8 @@ def bench(
 ) -> None:
     """Measure speed and memory, each beside its upper bound."""
     wanted = _checked_sections(sections)
+    if plot is not None:
+        outputs.check_free(plot, outputs.PICTURE)
     if plot is not None and plot.suffix.lower() not in _PICTURES:
         raise typer.BadParameter(
             f"a name that ends in {', '.join(_PICTURES)}, got {plot}", param_hint="--plot"

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hipg_bench.cli import console
+from hipg_bench.cli import console, outputs
 
 
 def export(
@@ -22,5 +22,6 @@ def export(
     from hipg_bench.evaluation.export import marl_eval
     from hipg_bench.paths import write_text
 
+    outputs.check_free(out, outputs.MARL_EVAL)
     write_text(out, json.dumps(marl_eval(folders), allow_nan=False) + "\n")
     console.say(str(out))

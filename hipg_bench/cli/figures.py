@@ -9,8 +9,10 @@ from typing import Annotated
 
 import typer
 
-from hipg_bench.cli import console
+from hipg_bench.cli import console, outputs
 from hipg_bench.errors import HipgError
+
+_VERDICTS = "verdicts.json"
 
 
 def figures(
@@ -28,7 +30,7 @@ def figures(
     """Draw the paper's figures from the bundles' learning curves and test its claims."""
     from hipg_bench.comparison import claims
     from hipg_bench.comparison import page as pages
-    from hipg_bench.comparison.figures import draw_all
+    from hipg_bench.comparison.figures import draw_all, figure_names
     from hipg_bench.comparison.traces import traces
     from hipg_bench.paths import write_text
 
@@ -37,9 +39,12 @@ def figures(
         raise HipgError(
             f"{agents} holds no learning curves of the comparison: run `hipg-bench collect` first"
         )
+    if not outputs.is_ours(out / _VERDICTS, outputs.VERDICTS):
+        for name in (_VERDICTS, *figure_names()):
+            outputs.check_free(out / name, outputs.VERDICTS)
     judged = claims.judge_all(runs)
     files = draw_all(runs, out)
-    write_text(out / "verdicts.json", json.dumps(pages.facts(judged), indent=2) + "\n")
+    write_text(out / _VERDICTS, json.dumps(pages.facts(judged), indent=2) + "\n")
     if page is not None:
         links = [os.path.relpath(path, page.parent) for path in files]
         pages.write_results(page, pages.results(judged, runs, links))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hipg_bench.cli import console
+from hipg_bench.cli import console, outputs
 from hipg_bench.cli.options import quoted
 
 if TYPE_CHECKING:
@@ -121,15 +121,16 @@ def pack(
     from hipg_bench.submissions.archive import pack as write
     from hipg_bench.submissions.check import check as look
 
+    inside = Path.cwd().resolve().is_relative_to(folder.resolve())
+    place = folder.resolve().parent if inside else Path()  # never into the folder that is packed
+    target = out or place / f"{folder.resolve().name}.zip"
+    outputs.check_free(target, outputs.ARCHIVE)
     findings = [finding for finding in look(folder, trust=trust) if finding.severity != "fine"]
     for finding in findings:
         _print(finding)
     if any(finding.severity == "error" for finding in findings):
         console.say("\nnot packed")
         raise typer.Exit(1)
-    inside = Path.cwd().resolve().is_relative_to(folder.resolve())
-    place = folder.resolve().parent if inside else Path()  # never into the folder that is packed
-    target = out or place / f"{folder.resolve().name}.zip"
     digest = write(folder, target)
     console.say(f"{target}: {target.stat().st_size} bytes, sha256 {digest}")
 

@@ -85,6 +85,11 @@ def draw_all(runs: Sequence[Trace], out: Path) -> list[Path]:
     return files
 
 
+def figure_names() -> list[str]:
+    """Names of the files that `draw_all` may write."""
+    return [f"{family}{band}.png" for family in FAMILIES for band in ("", "_iqm")]
+
+
 def draw(runs: Sequence[Trace], tasks: Sequence[str], algorithms: Sequence[str], band: Band) -> Figure:
     """Draw one panel per task."""
     columns = 2 if len(tasks) in (2, 4) else 3

@@ -161,7 +161,7 @@ def draw(found: Audit, path: Path, *, title: str) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("learned: what the critic says")
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=120, format="png")
+        figure.savefig(temporary, dpi=120, format="png", metadata={"Software": "hipg-bench"})
 
 
 def load(path: Path) -> tuple[Actor, Critic, Settings]:

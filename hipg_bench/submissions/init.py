@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Sequence
@@ -62,7 +63,7 @@ def init(
         )
     if tier not in (0, 1, 2):
         raise BundleError(f"tier {tier}: 0 (declared networks), 1 (ONNX) and 2 (Python) are allowed")
-    if folder.exists():
+    if os.path.lexists(folder):
         raise BundleError(f"{folder} is there already")
     if runs and tier != 0:
         raise BundleError(f"policies of training runs are of tier 0, got tier {tier}")

@@ -58,7 +58,8 @@ def draw(document: Mapping[str, Any], path: Path) -> None:
             f"{host['processor']}, {host['cores']} cores", fontsize=9, color=_FAINT, x=0.99, ha="right"
         )
         with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=_RESOLUTION)
+            key = "Software" if path.suffix.lower() == ".png" else "Creator"
+            figure.savefig(temporary, dpi=_RESOLUTION, metadata={key: "hipg-bench"})
 
 
 def _panels(sections: Mapping[str, Rows]) -> list[Callable[[Axes], None]]:
