@@ -81,7 +81,7 @@ def evaluate(
     ] = None,
     launcher: Annotated[
         str | None,
-        typer.Option(help="Play in many processes: local, ray or slurm; see docs/clusters.md."),
+        typer.Option(help="Play in many processes: local, ray or slurm; see docs/guides/many_machines.md."),
     ] = None,
     launcher_option: LauncherOptions = None,
     workers: Annotated[

@@ -14,7 +14,8 @@ from hipg_bench.cli.options import AgentArgument, quoted
 from hipg_bench.errors import HipgError
 
 app = typer.Typer(
-    help="Upload an agent to the Hugging Face Hub, or download one (docs/submit.md).", no_args_is_help=True
+    help="Upload an agent to the Hugging Face Hub, or download one (docs/guides/submit.md).",
+    no_args_is_help=True,
 )
 
 Repo = Annotated[str, typer.Argument(help="Repository on the Hub, USER/NAME.", metavar="USER/NAME")]
