@@ -96,7 +96,10 @@ def test_what_is_loaded_to_play_is_frozen(tmp_path):
     # the runner is loaded by this test alone: what it adds decides no row
     assert {
         str(path) for path in loaded - frozen if path.parts[0] in ("families", "mechanics", "policies")
-    } <= {f"policies/{name}.py" for name in ("__init__", "bundle", "card", "foreign", "graph", "simple")}
+    } <= {
+        f"policies/{name}.py"
+        for name in ("__init__", "bundle", "card", "foreign", "graph", "simple", "trained")
+    }
     assert {Path("env.py"), Path("sim.py"), Path("native.py"), Path("layout.py")} <= loaded & frozen
 
 
