@@ -124,9 +124,9 @@ def _link(
             for name, named in parts.items():
                 scope[name] = _module(name, named)
             plain = FunctionType(function.__code__, scope, function.__name__, function.__defaults__)
-            # what is kept on disk is kept under a name that says what it was made of
+            # a name says what machine code was made of: on disk, and where that of several families is loaded
             outermost = function is entry
-            plain.__qualname__ = function.__name__ + (f"_{mark}" if outermost else "")
+            plain.__qualname__ = f"{function.__name__}_{mark}"
             plain.__module__ = function.__module__
             done[function] = compiler(plain, outermost) if compiler else plain
         return done[function]
