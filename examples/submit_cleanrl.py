@@ -1,4 +1,4 @@
-"""A PPO of one's own, as CleanRL has it, on the leaderboard as Python code: docs/guides/submit.md, tier 2.
+"""A single-file PPO in CleanRL's style, on the leaderboard as Python code: docs/guides/submit.md, tier 2.
 
 Run, it trains with cleanrl_ppo.py and writes weights into an agent's folder. It is copied there too, since it
 is also the agent's code: its upper half is what is imported, in a process that has no torch loaded.

@@ -125,10 +125,9 @@ def _link(
                 scope[name] = _module(name, named)
             plain = FunctionType(function.__code__, scope, function.__name__, function.__defaults__)
             # a name says what machine code was made of: on disk, and where that of several families is loaded
-            outermost = function is entry
             plain.__qualname__ = f"{function.__name__}_{mark}"
             plain.__module__ = function.__module__
-            done[function] = compiler(plain, outermost) if compiler else plain
+            done[function] = compiler(plain, function is entry) if compiler else plain
         return done[function]
 
     return linked(entry)

@@ -220,7 +220,7 @@ def test_damaged_machine_code_is_compiled_again(tmp_path, damage):
 
 
 def test_a_rule_that_allocates_is_refused():
-    """Machine code of rules runs without the interpreter: there is nobody who would free the memory."""
+    """Compiled rules run without memory management: an array that they made would never be freed."""
 
     def allocates(memory, k, last, thread, unused):
         return len(np.zeros(k))

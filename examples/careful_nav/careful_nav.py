@@ -1,4 +1,4 @@
-"""A family of one's own: hazard navigation in which the team is charged for every drone that it loses.
+"""An example of your own family: hazard navigation in which every lost drone costs the team.
 
 What is not said here it has from its parent: world, rules, observations, films, expert, evaluation splits.
 `try_it.py` registers it for one process. ``--plugin examples/careful_nav/careful_nav.py`` makes it known to

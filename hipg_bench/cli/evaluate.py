@@ -81,7 +81,10 @@ def evaluate(
     ] = None,
     launcher: Annotated[
         str | None,
-        typer.Option(help="Play in many processes: local, ray or slurm; see docs/guides/many_machines.md."),
+        typer.Option(
+            help="Play in many processes: local, ray or slurm (the last two are untried); "
+            "see docs/guides/many_machines.md."
+        ),
     ] = None,
     launcher_option: LauncherOptions = None,
     workers: Annotated[

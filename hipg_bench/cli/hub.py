@@ -90,8 +90,8 @@ def _is_interactive() -> bool:
 
 
 def _list(folder: Path) -> None:
-    rows = console.table("file", ">bytes", "")
+    rows = console.table("file", ">bytes")
     for path in sorted(folder.rglob("*")):
         if path.is_file():
-            rows.add_row(str(path.relative_to(folder)), f"{path.stat().st_size:,}", "")
+            rows.add_row(str(path.relative_to(folder)), f"{path.stat().st_size:,}")
     console.show(rows)

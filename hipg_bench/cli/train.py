@@ -146,8 +146,7 @@ def train(
         ]
     )
     options = [
-        f"--task {quoted(str(task))}",
-        *plugin_options().split(" ")[1:],
+        f"--task {quoted(str(task))}{plugin_options()}",
         *([] if num_agents is None else [f"--num-agents {num_agents}"]),
         f"--algorithm {algorithm}",
         f"--preset {preset}",

@@ -1,26 +1,26 @@
 """Blocks: the parts of an evaluation that many processes and machines play into one folder.
 
 A block is the worlds of one evaluation seed, played by one policy. It has a folder of its own in
-``<out>/blocks``, which whoever plays it claims, and its rows appear there whole. `runner.evaluate` takes them
-over, plays what is missing, and writes what it always writes; then the blocks are removed.
+``<out>/blocks``, which the process that plays it claims, and its rows appear there whole. `runner.evaluate`
+takes them over, plays what is missing, and writes what it always writes; then the blocks are removed.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hipg_bench.claims import claimed
 from hipg_bench.documents import read_json
-from hipg_bench.errors import ResumeError
+from hipg_bench.errors import ResumeError, SpecError
 from hipg_bench.evaluation.episodes import EvaluationJob, Row
 from hipg_bench.evaluation.failures import OK, failures_of_a_dnf
 from hipg_bench.evaluation.seeds import WORLDS_PER_SEED
 from hipg_bench.launchers import Job, stop_when_orphaned
 from hipg_bench.paths import remove_partial, write_text
 from hipg_bench.policies.policy import Policy
-from hipg_bench.policies.trained import find_agent
 from hipg_bench.spec import TaskSpec
 
 FOLDER = "blocks"
@@ -28,7 +28,7 @@ FOLDER = "blocks"
 ROWS = "rows.jsonl"
 """The rows of a block in its folder."""
 RECORD = "run.json"
-"""The file beside them that says which evaluation they are of."""
+"""The file that says which evaluation a folder is of: in a block's, and in the evaluation's own."""
 
 
 class Block(NamedTuple):
@@ -88,6 +88,9 @@ def play(block: Block) -> None:
         HeldError: another process plays it.
         ResumeError: the folder belongs to another evaluation: of another agent, suite or engine version.
     """
+    # only who plays blocks needs to know how agents are found
+    from hipg_bench.policies.trained import find_agent
+
     check_record(block.out / RECORD, block.run)
     with claimed(block.folder, "evaluating") as claim:
         if block.finished:
@@ -97,31 +100,41 @@ def play(block: Block) -> None:
         seed = block.identity["train_seed"]
         if agent.fingerprint(spec.task, seed) != block.identity["policy"]:
             raise ResumeError(f"{block.agent}: its policy for {spec.task} is another one than at the start")
-        policy, rows = agent.policy(spec, seed), list[Row]()
-        left = failures_of_a_dnf(block.job.episodes)
-        for first in range(0, len(block.worlds), block.job.num_envs):
-            worlds = block.worlds[first : first + block.job.num_envs]
-            rows += block.job.play(spec, policy, worlds, lambda _: stop_when_orphaned(), failures=left)
-            left = failures_of_a_dnf(block.job.episodes) - sum(row["status"] != OK for row in rows)
+        others = set(range(block.job.episodes)) - set(block.worlds)
+        played = block.job.rows(
+            spec,
+            agent.policy(spec, seed),
+            [{"world": world, "status": OK} for world in others],
+            lambda _: stop_when_orphaned(),
+        )
+        rows = [block.identity | row for batch in played for row in batch]
         claim.check()
         write_text(block.folder / RECORD, json.dumps(block.run, indent=2) + "\n")
-        text = "".join(json.dumps(block.identity | row, allow_nan=False) + "\n" for row in rows)
+        text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows)
         write_text(block.folder / ROWS, text, sealed=True)
 
 
-def check_record(path: Path, run: dict[str, Any]) -> None:
-    """See that rows are of this evaluation.
+def check_record(path: Path, run: Mapping[str, Any]) -> None:
+    """See that a folder, by its ``run.json``, is of this evaluation.
 
     Raises:
-        ResumeError: they are of another agent, suite, engine version or of other worlds.
+        ResumeError: it is of another agent, suite, engine version or of other worlds, or the file is damaged.
     """
-    earlier = read_json(path)
+    try:
+        earlier = read_json(path)
+    except SpecError as error:
+        raise ResumeError(f"{path.name} is damaged: {error}; choose another --out") from error
     for name, value in run.items():
         if earlier.get(name) != value:
-            raise ResumeError(
-                f"{path} belongs to another evaluation: {name} is {earlier.get(name)!r} there and {value!r} "
-                f"here; choose another --out"
-            )
+            raise foreign(path, name, earlier.get(name), value)
+
+
+def foreign(path: Path, name: str, got: object, expected: object) -> ResumeError:
+    """What is raised where a file is of another evaluation."""
+    return ResumeError(
+        f"{path} belongs to another evaluation: {name} is {got!r} there and {expected!r} here; "
+        f"choose another --out"
+    )
 
 
 def cut_after_dnf(spec: TaskSpec, policy: Policy, rows: list[Row], job: EvaluationJob) -> list[Row]:

@@ -43,8 +43,6 @@ Progress = Callable[[str, float], None]
 """Told a task (or ``films``) and how many more of its episodes (or films) are done."""
 
 
-_RECORD = "run.json"
-"""The file that says which evaluation a folder is of."""
 _PATIENCE = 60.0
 """Seconds that another process has to begin an evaluation that is shared."""
 _FOLDERS = ("episodes", "films", "videos")
@@ -214,7 +212,7 @@ def prepare(agent: Agent, name: str, suite: Suite, out: Path, job: EvaluationJob
     until = time.monotonic() + _PATIENCE
     while True:
         _check_belongs(out, run)
-        if (out / _RECORD).exists():
+        if (out / blocks.RECORD).exists():
             break
         try:
             with _alone_in(out, run):
@@ -333,7 +331,7 @@ def _of_blocks(
         ResumeError: they are of another evaluation, or damaged.
     """
     found: dict[int, list[Row]] = {}
-    run = read_json(out / _RECORD)
+    run = read_json(out / blocks.RECORD)
     for path in sorted((out / blocks.FOLDER).glob(f"{spec.task}-seed*/{blocks.ROWS}")):
         blocks.check_record(path.with_name(blocks.RECORD), run)
         for row in _resumed(path, spec, identity, job):
@@ -365,14 +363,14 @@ def _resumed(path: Path, spec: TaskSpec, identity: Mapping[int, Row], job: Evalu
     for row in rows:
         expected = identity.get(row["train_seed"])
         if expected is None:
-            raise _foreign(path, "train_seed", row["train_seed"], list(identity))
+            raise blocks.foreign(path, "train_seed", row["train_seed"], list(identity))
         seed = job.told_seed(row["task"], row["world"])
         expected = expected | {"eval_seed": seed, "split": job.split}
         for name, value in expected.items():
             if row[name] != value:
-                raise _foreign(path, name, row[name], value)
+                raise blocks.foreign(path, name, row[name], value)
         if row["world"] >= job.episodes:
-            raise _foreign(path, "world", row["world"], f"below {job.episodes}")
+            raise blocks.foreign(path, "world", row["world"], f"below {job.episodes}")
     # a longer evaluation may still be finished
     return [row for row in rows if row["status"] != NOT_PLAYED]
 
@@ -385,11 +383,11 @@ def _alone_in(out: Path, run: Mapping[str, Any]) -> Generator[None]:
         ResumeError: as `evaluate` says.
     """
     _check_belongs(out, run)
-    with output_folder(out, _RECORD, _RESULTS, "evaluating"):
+    with output_folder(out, blocks.RECORD, _RESULTS, "evaluating"):
         _check_belongs(out, run)
         for folder in (out, *(out / name for name in _FOLDERS)):
             remove_partial(folder)
-        write_text(out / _RECORD, json.dumps(run, indent=2) + "\n")
+        write_text(out / blocks.RECORD, json.dumps(run, indent=2) + "\n")
         yield
 
 
@@ -399,20 +397,5 @@ def _check_belongs(out: Path, run: Mapping[str, Any]) -> None:
     Raises:
         ResumeError: it belongs to another evaluation, or ``run.json`` is damaged.
     """
-    path = out / _RECORD
-    if not path.exists():
-        return
-    try:
-        earlier = read_json(path)
-    except SpecError as error:
-        raise ResumeError(f"{path.name} is damaged: {error}; choose another --out") from error
-    for name, value in run.items():
-        if earlier.get(name) != value:
-            raise _foreign(path, name, earlier.get(name), value)
-
-
-def _foreign(path: Path, name: str, got: object, expected: object) -> ResumeError:
-    return ResumeError(
-        f"{path} belongs to another evaluation: {name} is {got!r} there and {expected!r} here; "
-        f"choose another --out"
-    )
+    if (out / blocks.RECORD).exists():
+        blocks.check_record(out / blocks.RECORD, run)

@@ -57,7 +57,7 @@ def register_family(name: str, module: ModuleType) -> None:
 
 
 def add_plugin(plugin: str) -> None:
-    """Import a module with families of one's own, here and in all processes that this one starts.
+    """Import a module with your own families, here and in all processes that this one starts.
 
     Args:
         plugin: a module's name or the path of its file (.py). It registers its families itself, or is a

@@ -101,9 +101,8 @@ class Live:
         """
         if not self._shows:
             raise RenderError(f"{self._job.spec.task}: nothing to render before reset() and after close()")
-        width, height = SIZE
         with self._lock:
-            return np.frombuffer(self._ask(width * height * 3), np.uint8).reshape(height, width, 3).copy()
+            return _pixels(self._ask(_bytes(SIZE)), SIZE)
 
     def close(self) -> None:
         """End the child."""
@@ -113,9 +112,7 @@ class Live:
 
     def _ask(self, size: int) -> bytes:
         """Send the rows that the child has not seen; its answer, empty where its window was closed."""
-        if self._child and self._child.parent != os.getpid():
-            self._child.end.detach()  # it draws for the process that this one was forked from
-            self._child = None
+        self._child = _own(self._child)
         if self._child is None:
             self._child = _Child(self._job)
             self._unseen = self._unseen or ([] if self._last is None else [self._last])
@@ -148,26 +145,40 @@ class Stills:
             RenderError: no OpenGL works here, or the child failed.
         """
         with self._lock:
-            if self._child and self._child.parent != os.getpid():
-                self._child.end.detach()
-                self._child = None
+            self._child = _own(self._child)
             if self._size != size:
                 self.close()
             if self._child is None:
                 self._child = _Child(Job(spec=self._spec, mode="still", size=size))
                 self._size = size
             try:
-                pixels = self._child.ask(_HEAD.pack(1, len(row)) + row.tobytes(), size[0] * size[1] * 3)
+                answer = self._child.ask(_HEAD.pack(1, len(row)) + row.tobytes(), _bytes(size))
             except BaseException:
                 self.close()  # a late answer would be taken for the next one
                 raise
-            return np.frombuffer(pixels, np.uint8).reshape(size[1], size[0], 3).copy()
+            return _pixels(answer, size)
 
     def close(self) -> None:
         """End the child."""
         if self._child:
             self._child.end()
         self._child = None
+
+
+def _bytes(size: tuple[int, int]) -> int:
+    return size[0] * size[1] * 3
+
+
+def _pixels(answer: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
+    return np.frombuffer(answer, np.uint8).reshape(size[1], size[0], 3).copy()
+
+
+def _own(child: _Child | None) -> _Child | None:
+    """The child, but that of a process which this one was forked from is left to draw for it."""
+    if child and child.parent != os.getpid():
+        child.end.detach()
+        return None
+    return child
 
 
 def png(picture: UInt8[np.ndarray, "height width 3"]) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import os
 import re
 import shutil
 import sys
@@ -50,7 +51,7 @@ def stage(folder: Path, out: Path, repo: str, *, evaluation: Path | None, video:
         BundleError: the bundle has errors, or the evaluation is of other policies.
         HipgError: no evaluation or video is there, or ``out`` exists.
     """
-    if out.exists():
+    if os.path.lexists(out):
         raise HipgError(f"{out} is there already: choose another folder")
     agent = load_agent(folder)
     _check_sound(agent.folder)
@@ -106,7 +107,7 @@ def pull(repo: str, out: Path | None, *, revision: str | None = None) -> tuple[P
         HipgError: there is no such repository, the Hub cannot be reached, or the folder exists.
     """
     hub = _library()
-    if out is not None and out.exists():
+    if out is not None and os.path.lexists(out):
         raise HipgError(f"{out} is there already: choose another folder with --out")
     parent = (out or Path("here")).absolute().parent
     parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +126,7 @@ def pull(repo: str, out: Path | None, *, revision: str | None = None) -> tuple[P
         _drop_front_matter(bundle / "README.md")
         _check_sound(bundle, repo)
         target = out or Path(load_agent(bundle).name)
-        if target.exists():
+        if os.path.lexists(target):
             raise HipgError(f"{target} is there already: choose another folder with --out")
         bundle.rename(target)
     return target, commit
